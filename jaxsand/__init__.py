@@ -1,0 +1,57 @@
+"""jaxsand: robots that shape sand, simulated in JAX.
+
+A height map settles to its angle of repose after each action of a tool. Names are resolved on first use, so that importing
+the package does not wait for JAX.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_HOMES = {
+    "DRY_SAND": "material",
+    "Blade": "tool",
+    "Closed": "walls",
+    "Draining": "walls",
+    "Grid": "grid",
+    "Material": "material",
+    "NoTool": "tool",
+    "Open": "walls",
+    "Outcome": "settling",
+    "OutcomeError": "sim",
+    "Plan": "planner",
+    "Pose": "tool",
+    "Relaxation": "settling",
+    "Scene": "scene",
+    "Settled": "settling",
+    "Shaped": "sim",
+    "SteppedPush": "push",
+    "Sweeps": "settling",
+    "UntilStill": "settling",
+    "Walls": "walls",
+    "Whole": "window",
+    "Window": "window",
+    "act": "sim",
+    "check": "sim",
+    "follow": "sim",
+    "follow_frames": "sim",
+    "make_scene": "scene",
+    "plan": "planner",
+    "rollout": "sim",
+    "settle": "settling",
+    "settle_batch": "settling",
+    "steepest_slope": "settling",
+    "step": "sim",
+    "step_batch": "sim",
+    "volume": "scene",
+}
+__all__ = [*_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'jaxsand' has no attribute {name!r}")
+    return getattr(import_module(f"jaxsand.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *globals()]

@@ -1,0 +1,123 @@
+"""The command line: degrees, millimetres, files and exit codes.
+
+A command that did its job exits with 0. On bad input it exits with 2 and one line on standard error, `error: field: what is
+wrong; what to do`. Arguments are read before JAX is imported, so that --help and mistakes answer at once.
+"""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+from jaxsand.commands import run_benchmark, run_plan, run_settle, run_shape
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command; returns its exit code."""
+    options = _parser().parse_args(arguments)
+    _keep_compiled_programs()
+    try:
+        options.run(options)
+    except ValueError as error:
+        return _fail(str(error))
+    except RuntimeError as error:
+        if type(error).__name__ != "OutcomeError":
+            raise
+        return _fail(f"outcome: {error}")
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="jaxsand", description="Robots that shape sand. Every command answers --help.")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+
+    p = commands.add_parser("shape", help="find the strokes that trench a goal, push them, show what came out")
+    p.add_argument("goal", help="a letter, a .txt map of # and ., a .png (dark is dug), a .npy height map in m, or terrain")
+    p.add_argument("--method", choices=["plan", "strokes"], default="plan", help="strokes: push a glyph's own strokes")
+    p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
+    p.add_argument("--surface", default="level", help="what lies there before: level, terrain or a .npy file (m)")
+    p.add_argument("--relief-mm", type=_number, default=10.0, help="height range of --surface terrain")
+    p.add_argument("--depth-mm", type=_number, help="trench depth (3; 7.5 for .npy and terrain)")
+    p.add_argument("--spacing", type=_number, default=0.01, help="grid spacing in m (0.01)")
+    p.add_argument("--resolution", type=_count, default=6, help="grid cells to a map cell (6)")
+    p.add_argument("--cells", type=_count, default=48, help="grid cells along the longer side of a .png or terrain (48)")
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (shape-GOAL)")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(run=run_shape)
+
+    p = commands.add_parser("settle", help="let a height map settle to its angle of repose")
+    p.add_argument("input", type=Path, metavar="IN.npy", help="height map [H, W] in m")
+    p.add_argument("--out-file", type=Path, required=True, metavar="OUT.npy")
+    p.add_argument("--spacing", type=_number, default=0.01, metavar="M", help="grid spacing in m (0.01)")
+    p.add_argument("--repose-deg", type=_number, default=29.0, help="angle of repose (29)")
+    p.add_argument("--neighbours", type=int, choices=[4, 8], default=8)
+    p.add_argument("--scheme", choices=["relaxation"], default="relaxation", help="the paper's sweep at k = dx^2/8")
+    p.add_argument("--tol", type=_number, default=1e-3, help="largest slope in excess of repose, a tangent (1e-3)")
+    p.add_argument("--bound", type=_count, default=200_000, help="most sweeps (200000)")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(run=run_settle)
+
+    p = commands.add_parser("plan", help="the shortest single stroke over a binary map")
+    p.add_argument("map", metavar="MAP.txt", help="rows of # (dig) and ., S marks the start; or a letter")
+    p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
+    p.add_argument("--engine", choices=["auto", "astar"], default="auto")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(run=run_plan)
+
+    p = commands.add_parser("bench", help="speed, side by side with plain numpy and plain C")
+    p.add_argument("what", nargs="?", choices=["settle", "push", "all"], default="all")
+    p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(run=run_benchmark)
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Mistakes become one line `error: field: what; remedy` and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        field, _, what = message.removeprefix("argument ").partition(": ")
+        if not what:
+            field, what = "arguments", message
+        field = field.split("/")[-1].removeprefix("--")
+        raise SystemExit(_fail(f"{field}: {what}; see {self.prog} --help"))
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"got {text!r}, which is no number") from None
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number of at least 1")
+    return int(text)
+
+
+def _fail(message: str) -> int:
+    if sys.stderr.isatty():
+        print("\r\033[K", end="", file=sys.stderr)
+    print("error: " + " ".join(message.split()), file=sys.stderr)
+    return 2
+
+
+def _keep_compiled_programs() -> None:
+    """Lets JAX keep compiled programs in the user's cache, so that a second run starts fast."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsand"
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""Where sand goes that a tool displaces.
+
+Whenever the share of a cell that the tool covers grows from a to b, the share (b - a) / (1 - a) of its sand above the
+tool's bottom has to leave. It goes to neighbouring cells, to the one or two of the eight that lie in its direction, shared
+as the direction divides the angle between them; it comes to rest in their open share and moves on in the rest. Sand that has
+nowhere to go, at a wall or a closed edge, stays in its column; over a draining edge it is lost. Every amount is a whole
+number of quanta (see sweep.py), so that volume is kept as well as floats allow.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsand.loop import repeat_until
+from jaxsand.sweep import SHUT, Bed, Flow, Lost, at, halo, truncate
+from jaxsand.tool import Blade, Pose, local
+
+_EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
+Shares = list[jax.Array]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Job:
+    """What every part of a push needs: the bed, the cell centres (m), the tool, its bottom's height (m), how sand flows."""
+
+    bed: Bed
+    x: jax.Array  # [1, W]
+    y: jax.Array  # [H, 1]
+    tool: Blade
+    bottom: jax.Array  # []
+    flow: Flow
+
+
+def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Takes up the sand that has to leave as the cover grows: the height left and the height taken."""
+    open_before = 1 - before
+    shut = open_before < SHUT
+    share = jnp.where(shut, 1, (cover - before) / jnp.where(shut, 1, open_before))
+    taken = _whole(job, share * jnp.where(h > job.bottom, h - job.bottom, 0))
+    return h - taken, taken
+
+
+def pass_on(
+    job: Job, share: Shares, free: jax.Array, h: jax.Array, lost: Lost, carried: jax.Array
+) -> tuple[jax.Array, Lost, jax.Array]:
+    """Hands `carried` [H, W] on by one cell, the shares for the eight neighbours given; it rests where cells are `free`."""
+    room = halo(jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype), 0.0)
+    if job.bed.rim is not None:
+        room = room + job.bed.rim.beyond
+    source = halo(carried, 0.0)
+    received, kept = jnp.zeros_like(h), carried
+    for (di, dj), s in zip(_EIGHT, share, strict=True):
+        given = _whole(job, s * carried) * at(room, di, dj)
+        kept = kept - given
+        s_there = at(halo(s, 0.0), -di, -dj) if s.ndim else s
+        received = received + _whole(job, s_there * at(source, -di, -dj)) * at(room)
+        if job.bed.rim is not None and lost is not None:
+            lost = lost + given * at(job.bed.rim.beyond, di, dj)
+    rest = _whole(job, free * received)
+    return h + (rest + kept), lost, received - rest
+
+
+def shares(p: jax.Array, q: jax.Array) -> Shares:
+    """Shares of the eight neighbours for a direction (p along columns, q along rows) of largest component 1 or less.
+
+    Bilinear; the part that would stay in place goes to the four straight neighbours alike.
+    """
+    columns = {-1: jnp.maximum(-p, 0), 0: 1 - jnp.abs(p), 1: jnp.maximum(p, 0)}
+    rows = {-1: jnp.maximum(-q, 0), 0: 1 - jnp.abs(q), 1: jnp.maximum(q, 0)}
+    stay = rows[0] * columns[0] / 4
+    return [rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in _EIGHT]
+
+
+def radial(job: Job, pose: Pose) -> Shares:
+    """The shares for directions away from the blade's centre, in its proportions; shorter within a cell of the centre."""
+    along, across = local(pose, job.x, job.y)
+    s, n = along / job.tool.thickness**2, across / job.tool.width**2
+    p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
+    size = jnp.maximum(jnp.abs(p), jnp.abs(q))
+    cells = jnp.maximum(jnp.abs(job.x - pose.x), jnp.abs(job.y - pose.y)) / job.bed.spacing
+    scale = jnp.where(size > 0, jnp.minimum(cells, 1) / jnp.where(size > 0, size, 1), 0)
+    return shares(p * scale, q * scale)
+
+
+def spread(job: Job, share: Shares, free: jax.Array, h: jax.Array, lost: Lost, carried: jax.Array) -> tuple[jax.Array, Lost]:
+    """Hands `carried` on until all of it rests."""
+    rows, columns = h.shape
+    (h, lost, carried), _ = repeat_until(_at_rest, _onward, rows + columns, (job, share, free), (h, lost, carried))
+    return h + carried, lost
+
+
+def _at_rest(params: Any, _: jax.Array, state: Any) -> jax.Array:
+    return ~jnp.any(state[2] > 0)
+
+
+def _onward(params: Any, _: jax.Array, state: Any) -> Any:
+    return pass_on(*params, *state)
+
+
+def _whole(job: Job, amount: jax.Array) -> jax.Array:
+    return truncate(amount / job.flow.quantum) * job.flow.quantum

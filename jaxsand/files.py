@@ -1,0 +1,52 @@
+"""Files and folders of the command line, and its progress line."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def existing(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file; check the name")
+    return path
+
+
+def read_text(path: Path) -> str:
+    try:
+        return existing(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read as text ({type(error).__name__}); give rows of # and .") from None
+
+
+def folder(path: Path) -> Path:
+    """The folder, made if need be, once a file could be written in it."""
+    probe = path / f".jaxsand-{os.getpid()}"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"out: cannot write to {path} ({error.strerror}); choose another folder") from None
+    return path
+
+
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """A file beside `path` to write to, which takes its place when all went well."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield beside
+        beside.replace(path)
+    except OSError as error:
+        raise ValueError(f"out: cannot write {path} ({error.strerror}); choose another folder") from None
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def progress() -> Callable[[str], None]:
+    """Tells what goes on, on a terminal's one line; silent when piped."""
+    if not sys.stderr.isatty():
+        return lambda _: None
+    return lambda text: print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)

@@ -1,0 +1,142 @@
+"""Goals and surfaces from real input: letters, text maps, images, height maps, terrain. Host side, numpy only."""
+
+import json
+import string
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Cell = tuple[int, int]
+
+
+def letter_strokes(letter: str) -> np.ndarray:
+    """The strokes [n, 4] = x0, y0, x1, y1 of a capital letter in the unit square, y up."""
+    table = _stroke_letters()
+    if letter not in table:
+        raise ValueError(f"letter: got {letter!r}; give one of {string.ascii_uppercase}")
+    return np.array(table[letter], float)
+
+
+def letter_map(letter: str) -> tuple[np.ndarray, Cell]:
+    """The 7 x 7 binary map of a capital letter (row 0 on top) and the cell where its single stroke starts.
+
+    A, S, T and R are the maps that best explain the counts published in arXiv:1908.02745.
+    """
+    table = _map_letters()
+    if letter not in table:
+        raise ValueError(f"letter: got {letter!r}; give one of {string.ascii_uppercase}")
+    return table[letter]
+
+
+def read_text_map(text: str, name: str = "map") -> tuple[np.ndarray, Cell | None]:
+    """A map of `#` (dig) and `.`, one row a line, top row first; `S` is a cell to dig where the stroke starts.
+
+    Lines that are empty, and comments, which start with `# `, are no part of it.
+    """
+    lines = [line.rstrip() for line in text.splitlines()]
+    lines = [line for line in lines if line.strip() and not line.startswith("# ")]
+    if not lines:
+        raise ValueError(f"{name}: got no rows; give rows of # (dig) and .")
+    for number, line in enumerate(lines, 1):
+        wrong = sorted(set(line) - set("#.S"))
+        if wrong:
+            raise ValueError(f"{name}: got {wrong[0]!r} in row {number}; rows may hold only #, . and S")
+        if len(line) != len(lines[0]):
+            raise ValueError(
+                f"{name}: got {len(line)} cells in row {number}, {len(lines[0])} in row 1; make rows equally long"
+            )
+    cells = np.array([list(line) for line in lines])
+    starts = [(int(r), int(c)) for r, c in np.argwhere(cells == "S")]
+    if len(starts) > 1:
+        raise ValueError(f"{name}: got {len(starts)} starts; mark at most one cell with S")
+    dig = cells != "."
+    if not dig.any():
+        raise ValueError(f"{name}: got no cell to dig; mark at least one with #")
+    return dig, starts[0] if starts else None
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """A picture as a map of 0 (white) to -1 (black), row 0 at the bottom; transparency counts as white."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            flat = Image.new("RGBA", image.size, "white")
+            flat.alpha_composite(image.convert("RGBA"))
+    except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, OSError) as error:
+        raise ValueError(f"{path}: cannot be read as a picture ({_reason(error)}); give a PNG file") from None
+    grey = np.asarray(flat.convert("L"), float)
+    return np.flipud(grey / 255 - 1)
+
+
+def read_heights(path: str | Path) -> np.ndarray:
+    """A height map [H, W] (m) from a .npy file."""
+    try:
+        heights = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path}: cannot be read as a .npy array ({_reason(error)}); save one with numpy.save") from None
+    if not isinstance(heights, np.ndarray) or heights.ndim != 2 or not heights.size:
+        shape = list(getattr(heights, "shape", []))
+        raise ValueError(f"{path}: got shape {shape}; give one height map [H, W] with at least one cell")
+    if heights.dtype.kind not in "fiu":
+        raise ValueError(f"{path}: got dtype {heights.dtype}; give heights in metres as floats")
+    return heights
+
+
+def terrain() -> np.ndarray:
+    """Real terrain: elevations (m) around the Jacksboro fault, 344 x 403 cells, row 0 in the south.
+
+    The digital elevation model that matplotlib ships as a sample (USGS data).
+    """
+    from matplotlib.cbook import get_sample_data
+
+    data: Any = get_sample_data("jacksboro_fault_dem.npz")
+    with data:
+        return np.flipud(np.array(data["elevation"], dtype=float))
+
+
+def text_strokes(text: str) -> np.ndarray:
+    """The strokes [n, 4] of any text in the unit square, y up, in Hershey's single-stroke Roman font.
+
+    Needs the extra `letters`: pip install 'jaxsand[letters]'.
+    """
+    try:
+        from HersheyFonts import HersheyFonts
+    except ImportError:
+        raise ValueError(f"text: {text!r} needs the Hershey fonts; run pip install 'jaxsand[letters]'") from None
+    font = HersheyFonts()
+    font.load_default_font("rowmans")
+    lines = np.array([[*a, *b] for a, b in font.lines_for_text(text)], float)
+    if not lines.size:
+        raise ValueError(f"text: got {text!r}, which has no strokes; give letters, digits or signs")
+    points = lines.reshape(-1, 2, 2)
+    low = points.min((0, 1))
+    size = float(np.max(points.max((0, 1)) - low)) or 1.0
+    return ((points - low) / size + (1 - (points.max((0, 1)) - low) / size) / 2).reshape(-1, 4)
+
+
+@cache
+def _stroke_letters() -> dict[str, list[list[float]]]:
+    table: dict[str, list[list[float]]] = json.loads(_data("letters.json"))
+    return table
+
+
+@cache
+def _map_letters() -> dict[str, tuple[np.ndarray, Cell]]:
+    table = {}
+    for block in _data("letter_maps.txt").split("\n\n")[1:]:
+        head, _, rows = block.strip().partition("\n")
+        letter, row, column = head.split()
+        table[letter] = (read_text_map(rows)[0], (int(row), int(column)))
+    return table
+
+
+def _data(name: str) -> str:
+    return resources.files("jaxsand").joinpath("data", name).read_text(encoding="utf-8")
+
+
+def _reason(error: BaseException) -> str:
+    return (getattr(error, "strerror", None) or str(error).split("\n")[0])[:80]

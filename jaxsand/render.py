@@ -1,0 +1,127 @@
+"""Pictures: maps beside their goal, and the sand being pushed. The only file that draws."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxsand.shaping import ShapeResult
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_HEIGHTS = "RdYlBu_r"
+_ERRORS = "PuOr"
+_SAND = ((0.42, 0.30, 0.18), (0.80, 0.66, 0.44), (0.98, 0.92, 0.76))  # shadow, level sand, light
+
+
+def shape_figure(result: ShapeResult) -> "Figure":
+    """Goal, result with the tool's path, their difference, and the sand lit from the north-west."""
+    from matplotlib.figure import Figure
+
+    target, f = result.target, result.figures
+    figure = Figure(figsize=(11, 10), layout="constrained")
+    axes = figure.subplots(2, 2)
+    goal, after = target.goal * 1e3, result.after * 1e3
+    top = 2.5e3 * target.depth if target.drawn else _span(goal, after)
+    _map(axes[0, 0], goal, target, "goal", _HEIGHTS, top, "height (mm)")
+    _map(axes[0, 1], after, target, "result and path", _HEIGHTS, top, "height (mm)")
+    _path(axes[0, 1], result)
+    error = after - goal
+    span = top if target.drawn else max(_span(error), 1e-2)
+    _map(axes[1, 0], error, target, "result - goal", _ERRORS, span, "difference (mm)")
+    axes[1, 1].imshow(lit(result.after, float(target.scene.grid.spacing)), origin="lower", extent=_extent(target))
+    axes[1, 1].set(title="the sand, lit from the north-west", xlabel="x (m)", ylabel="y (m)")
+    figure.suptitle(
+        f"{target.name}: {result.steps} steps, IoU {f['iou']:.3f}, l2 reduction {f['l2_reduction']:.3f}, "
+        f"steepest slope {f['max_slope_deg']:.1f}°"
+    )
+    return figure
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Writes a PNG."""
+    figure.savefig(path, dpi=110, format="png")
+
+
+def save_animation(result: ShapeResult, path: Path, width: int = 420, milliseconds: int = 90) -> None:
+    """Writes a GIF of the sand being pushed, with the tool's outline."""
+    from PIL import Image, ImageDraw
+
+    grid = result.target.scene.grid
+    dx = float(grid.spacing)
+    rows, columns = grid.shape
+    zoom = max(1, round(width / max(rows, columns)))
+    frames = []
+    for height, tool in zip(result.frames, result.tools, strict=True):
+        picture = np.flipud((lit(height, dx)[..., :3] * 255).astype(np.uint8))
+        image = Image.fromarray(picture).resize((columns * zoom, rows * zoom), Image.Resampling.BICUBIC)
+        if np.all(np.isfinite(tool)):
+            corners = _outline(result, tool) / dx * zoom
+            corners[:, 1] = rows * zoom - corners[:, 1]
+            ImageDraw.Draw(image).polygon([tuple(c) for c in corners], outline=(30, 30, 40), fill=(70, 80, 95))
+        frames.append(image.quantize(96))
+    frames[0].save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=[*[milliseconds] * (len(frames) - 1), 1500],
+        loop=0,
+        disposal=1,
+    )
+
+
+def lit(height: np.ndarray, spacing: float) -> np.ndarray:
+    """A map as sand in slanting light, RGBA [H, W, 4]: Lambert's law for a lamp 40 degrees up in the north-west."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    rows, columns = height.shape
+    slope_y = np.gradient(height, spacing, axis=0) if rows > 1 else np.zeros_like(height)
+    slope_x = np.gradient(height, spacing, axis=1) if columns > 1 else np.zeros_like(height)
+    up = np.sin(np.radians(40))
+    side = np.cos(np.radians(40)) / np.sqrt(2)
+    brightness = (up + side * slope_x - side * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
+    sand = LinearSegmentedColormap.from_list("sand", [(0.0, _SAND[0]), (up, _SAND[1]), (1.0, _SAND[2])])
+    shade: np.ndarray = sand(np.clip(brightness, 0, 1))
+    return shade
+
+
+def _map(axes: "Axes", values: np.ndarray, target: Any, title: str, colours: str, top: float, label: str) -> None:
+    image = axes.imshow(values, origin="lower", extent=_extent(target), cmap=colours, vmin=-top, vmax=top)
+    axes.set(title=title, xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    over = "both" if np.abs(values).max() > top else "neither"
+    axes.figure.colorbar(image, ax=axes, label=label, shrink=0.85, extend=over)
+
+
+def _path(axes: "Axes", result: ShapeResult) -> None:
+    for number, path in enumerate(result.target.paths):
+        axes.plot(*path.T, "-", color="black", lw=1.2, alpha=0.7)
+        axes.plot(*path[0], "o", color="black", ms=6, label="lowered" if not number else None)
+        axes.plot(*path[-1], "s", color="black", ms=6, mfc="none", label="lifted" if not number else None)
+        runs = np.diff(path, axis=0)
+        middle = (path[:-1] + path[1:]) / 2
+        axes.quiver(*middle.T, *_unit(runs).T, angles="xy", scale=38, width=0.006, pivot="mid", color="black")
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.6)
+
+
+def _unit(runs: np.ndarray) -> np.ndarray:
+    length = np.hypot(*runs.T)[:, None]
+    return np.where(length > 0, runs / np.where(length > 0, length, 1), np.nan)
+
+
+def _outline(result: ShapeResult, tool: np.ndarray) -> np.ndarray:
+    x, y, cos, sin = tool
+    corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) / 2 * result.target.footprint
+    return np.stack([x + corners @ [cos, -sin], y + corners @ [sin, cos]], 1)
+
+
+def _extent(target: Any) -> tuple[float, float, float, float]:
+    rows, columns = target.scene.grid.shape
+    dx = float(target.scene.grid.spacing)
+    return (0, columns * dx, 0, rows * dx)
+
+
+def _span(*maps: np.ndarray) -> float:
+    return max(1e-6, *(float(np.abs(m).max()) for m in maps))

@@ -1,0 +1,215 @@
+"""A scene: everything about the sand except its height."""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.grid import Grid, Neighbours
+from jaxsand.material import DRY_SAND, Material
+from jaxsand.tool import Blade, NoTool
+from jaxsand.walls import Closed, Draining, Open, Walls
+from jaxsand.window import Whole, Window
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scene:
+    """Grid, material, walls, edge, window and tool; each has a neutral member that costs nothing. See `make_scene`."""
+
+    grid: Grid
+    material: Material = DRY_SAND
+    walls: Open | Walls = field(default_factory=Open)
+    edge: Closed | Draining = field(default_factory=Closed)
+    window: Whole | Window = field(default_factory=Whole)
+    tool: NoTool | Blade = field(default_factory=NoTool)
+
+
+def make_scene(
+    shape: tuple[int, int],
+    spacing: jax.typing.ArrayLike,
+    repose_angle: jax.typing.ArrayLike = DRY_SAND.repose_angle,
+    neighbours: Neighbours = 8,
+    *,
+    tool: NoTool | Blade | None = None,
+    walls: Open | Walls | None = None,
+    edge: Closed | Draining | None = None,
+    window: Whole | Window | None = None,
+) -> Scene:
+    """A checked scene.
+
+    Args:
+      shape: rows and columns of the height map.
+      spacing: distance of neighbouring cell centres, m.
+      repose_angle: rad, above 0 and below pi/2; a scalar or one per cell [H, W].
+      neighbours: 4, or 8 (diagonal links are sqrt(2) spacings long).
+      tool, walls, edge, window: what the scene has of these; by default nothing.
+
+    Raises:
+      ValueError: names the field, the value and the remedy. Values that are being traced (jit, vmap, grad) are not checked.
+    """
+    shape = _shape(shape)
+    _positive("spacing", spacing, "give the distance of cell centres in metres, such as 0.01")
+    _angle(repose_angle, shape)
+    if neighbours not in (4, 8):
+        raise ValueError(f"neighbours: got {neighbours!r}; choose 4 or 8")
+    scene = Scene(
+        Grid(_number(spacing), shape, neighbours),
+        Material(_number(repose_angle)),
+        Open() if walls is None else walls,
+        Closed() if edge is None else edge,
+        Whole() if window is None else window,
+        NoTool() if tool is None else tool,
+    )
+    _check_walls(scene.walls, shape)
+    _check_edge(scene.edge)
+    _check_window(scene.window, shape)
+    _check_tool(scene.tool, scene.grid)
+    return scene
+
+
+def volume(scene: Scene, height: jax.Array) -> jax.Array:
+    """Volume of the sand above height 0 (m^3): dx^2 times the sum over the cells that are not solid. Differentiable."""
+    if isinstance(scene.walls, Walls):
+        height = jnp.where(scene.walls.solid, 0, height)
+    return jnp.sum(height) * jnp.asarray(scene.grid.spacing, height.dtype) ** 2
+
+
+def fit(scene: Scene, height: jax.typing.ArrayLike) -> tuple[Scene, jax.Array]:
+    """The height as a float array of the scene's shape, and the scene with every float cast to the height's dtype."""
+    height = jnp.asarray(height)
+    if not jnp.issubdtype(height.dtype, jnp.floating):
+        raise ValueError(f"height: got dtype {height.dtype}; convert it to float32 or float64 metres")
+    if height.shape != scene.grid.shape:
+        rows, columns = scene.grid.shape
+        remedy = "use jax.vmap" if height.shape[-2:] == scene.grid.shape else f"give a map of shape [{rows}, {columns}]"
+        raise ValueError(f"height: got shape {list(height.shape)}, the scene has [{rows}, {columns}]; {remedy}")
+    return cast(scene, height.dtype), height
+
+
+def cast(tree: Any, dtype: jax.typing.DTypeLike) -> Any:
+    """Every float leaf as an array of `dtype`, so that 0.5, np.float32(0.5) and an array of it share one program."""
+
+    def one(leaf: Any) -> Any:
+        if jnp.issubdtype(jnp.result_type(leaf), jnp.bool_):
+            return jnp.asarray(leaf)
+        return jnp.asarray(leaf, dtype)
+
+    return jax.tree.map(one, tree)
+
+
+def with_tool(scene: Scene, tool: NoTool | Blade) -> Scene:
+    """The same scene with another tool, checked."""
+    _check_tool(tool, scene.grid)
+    return replace(scene, tool=tool)
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """The value as a numpy array, or None while it is being traced."""
+    if isinstance(value, jax.core.Tracer):
+        return None
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):
+        return None
+    return array if array.dtype.kind in "fiub" else np.full((), np.nan)
+
+
+def _number(value: Any) -> Any:
+    return float(value) if isinstance(value, (int, float)) else value
+
+
+def _shape(shape: Any) -> tuple[int, int]:
+    try:
+        rows, columns = shape
+        good = all(int(n) == n and not isinstance(n, bool) and n >= 1 for n in (rows, columns))
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise ValueError(f"shape: got {shape!r}; give two whole numbers of at least 1, (rows, columns)")
+    return int(rows), int(columns)
+
+
+def _positive(name: str, value: Any, remedy: str) -> None:
+    array = concrete(value)
+    if array is not None and not (array.size and np.all(np.isfinite(array)) and np.all(array > 0)):
+        raise ValueError(f"{name}: got {value!r}; it must be finite and above 0: {remedy}")
+
+
+def _finite(name: str, value: Any, remedy: str) -> None:
+    array = concrete(value)
+    if array is not None and not (array.size and np.all(np.isfinite(array))):
+        raise ValueError(f"{name}: got {value!r}; it must be finite: {remedy}")
+
+
+def _angle(angle: Any, shape: tuple[int, int]) -> None:
+    array = concrete(angle)
+    if array is None:
+        return
+    if not np.all(np.isfinite(array)) or not np.all((array > 0) & (array < math.pi / 2)):
+        worst = array.ravel()[np.argmax(~((array > 0) & (array < math.pi / 2)).ravel())] if array.size else array
+        raise ValueError(
+            f"repose_angle: got {worst} rad; it must lie above 0 and below pi/2: for degrees use math.radians(29)"
+        )
+    if array.ndim not in (0, 2) or (array.ndim == 2 and array.shape != shape):
+        raise ValueError(f"repose_angle: got shape {list(array.shape)}; give one number or a map of shape {list(shape)}")
+
+
+def _check_walls(walls: Any, shape: tuple[int, int]) -> None:
+    if isinstance(walls, Walls):
+        solid = concrete(walls.solid)
+        if solid is not None and (solid.dtype != bool or solid.shape != shape):
+            raise ValueError(
+                f"walls.solid: got {solid.dtype} of shape {list(solid.shape)}; give booleans of shape {list(shape)}"
+            )
+    elif not isinstance(walls, Open):
+        raise ValueError(f"walls: got {walls!r}; give Open() or Walls(solid)")
+
+
+def _check_edge(edge: Any) -> None:
+    if isinstance(edge, Draining):
+        _finite("edge.level", edge.level, "give the height of the rim in metres")
+    elif not isinstance(edge, Closed):
+        raise ValueError(f"edge: got {edge!r}; give Closed() or Draining(level)")
+
+
+def _check_window(window: Any, shape: tuple[int, int]) -> None:
+    if isinstance(window, Window):
+        try:
+            inside = len(window.size) == 2 and all(1 <= int(n) <= m for n, m in zip(window.size, shape, strict=True))
+        except (TypeError, ValueError):
+            inside = False
+        if not inside:
+            raise ValueError(
+                f"window.size: got {window.size!r}; give (rows, columns) from 1 up to the map's {shape}, or use Whole()"
+            )
+        tolerance = concrete(window.tolerance)
+        if tolerance is not None and not np.all(tolerance >= 0):
+            raise ValueError(f"window.tolerance: got {window.tolerance!r}; give 0 or a small positive number of spacings")
+    elif not isinstance(window, Whole):
+        raise ValueError(f"window: got {window!r}; give Whole() or Window(size)")
+
+
+def _check_tool(tool: Any, grid: Grid) -> None:
+    if isinstance(tool, Blade):
+        _positive("tool.width", tool.width, "give the blade's width in metres")
+        _positive("tool.thickness", tool.thickness, "give the blade's thickness in metres")
+        _finite("tool.depth", tool.depth, "give the depth of the blade's bottom below height 0 in metres")
+        thickness, dx = concrete(tool.thickness), concrete(grid.spacing)
+        if thickness is None or dx is None:
+            return
+        if np.any(thickness < dx * (1 - 1e-6)):
+            raise ValueError(
+                f"tool.thickness: got {tool.thickness!r} m, thinner than a cell of {grid.spacing!r} m; "
+                "thicken the blade or refine the grid"
+            )
+        if np.any(thickness > dx * math.hypot(*grid.shape)):
+            raise ValueError(
+                f"tool.thickness: got {tool.thickness!r} m, more than the map's diagonal; "
+                "give lengths in metres, or enlarge the map"
+            )
+    elif not isinstance(tool, NoTool):
+        raise ValueError(f"tool: got {tool!r}; give NoTool() or Blade(width, thickness, depth)")

@@ -1,0 +1,231 @@
+"""The simulator: a tool acts, the sand settles."""
+
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.push import Pushed, SteppedPush, push_along
+from jaxsand.scene import Scene, cast, concrete, fit
+from jaxsand.settling import Outcome, Relaxation, Settled, Stop, as_batch, check_chunk, check_rule, relax, wide_vectors
+from jaxsand.tool import Pose
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Shaped(Settled):
+    """A settled map (see `Settled`) and the `pose` in which the tool was lifted."""
+
+    pose: Pose
+
+
+def act(
+    scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike, *, push: SteppedPush | None = None
+) -> Pushed:
+    """What the tool does to a map [H, W] (m) along `stroke` [4] = x0, y0, x1, y1 (m), up to when it is lifted.
+
+    The map is not settled afterwards; see `step`.
+    """
+    scene, height, rules = _ready(scene, height, push, None, None)
+    return _act(scene, height, _stroke(stroke, height.dtype), rules)
+
+
+def step(
+    scene: Scene,
+    height: jax.typing.ArrayLike,
+    stroke: jax.typing.ArrayLike,
+    *,
+    push: SteppedPush | None = None,
+    scheme: Relaxation | None = None,
+    stop: Stop | None = None,
+) -> Shaped:
+    """One straight push on a map [H, W] (m), then settling. One map; batch with `jax.vmap` or `step_batch`.
+
+    `stroke` [4] is x0, y0, x1, y1 (m). The tool is lowered at the start, moved to the end and lifted. Parts of a stroke that
+    lie off the map touch nothing; a stroke of no length lowers and lifts the tool, facing +x. A stroke that is not finite
+    leaves the map as it is and says so in the outcome.
+
+    Differentiable once, in forward and reverse mode, in the height, the stroke, the angle of repose and the tool; exactly
+    zero where nothing changes (a stroke off the map, a tool above the sand). Continuous in the stroke, except where its
+    length goes to zero and its heading is lost.
+    """
+    return follow(scene, height, _stroke(stroke, jnp.result_type(height)), push=push, scheme=scheme, stop=stop)
+
+
+def follow(
+    scene: Scene,
+    height: jax.typing.ArrayLike,
+    path: jax.typing.ArrayLike,
+    *,
+    push: SteppedPush | None = None,
+    scheme: Relaxation | None = None,
+    stop: Stop | None = None,
+) -> Shaped:
+    """A path of legs without lifting the tool on a map [H, W] (m), then settling.
+
+    `path` [n, 2] holds x, y (m). The tool is lowered once, at the first point, and takes the sand in front of it along. At a
+    corner it turns in place about its centre: what it newly covers leaves radially, the heap it had pushed stays where it
+    is. At a reversal it therefore covers nothing new, leaves its heap behind and pushes with its other face. A leg of no
+    length keeps the heading.
+    """
+    scene, height, rules = _ready(scene, height, push, scheme, stop)
+    return _follow(scene, height, _path(path, height.dtype), rules)[0]
+
+
+def follow_frames(
+    scene: Scene,
+    height: jax.typing.ArrayLike,
+    path: jax.typing.ArrayLike,
+    *,
+    push: SteppedPush | None = None,
+    scheme: Relaxation | None = None,
+    stop: Stop | None = None,
+) -> tuple[Shaped, jax.Array]:
+    """`follow`, and the map after each leg, before the tool is lifted: [n - 1, H, W] (m)."""
+    scene, height, rules = _ready(scene, height, push, scheme, stop)
+    return _follow(scene, height, _path(path, height.dtype), rules, record=_itself)
+
+
+def rollout(
+    scene: Scene,
+    height: jax.typing.ArrayLike,
+    strokes: jax.typing.ArrayLike,
+    *,
+    push: SteppedPush | None = None,
+    scheme: Relaxation | None = None,
+    stop: Stop | None = None,
+) -> Shaped:
+    """Pushes one after the other: `strokes` [n, 4] (m). Every field of the result gains a leading axis of length n."""
+    scene, height, rules = _ready(scene, height, push, scheme, stop)
+    strokes = jnp.asarray(strokes, height.dtype)
+    if strokes.ndim != 2 or strokes.shape[1] != 4:
+        raise ValueError(f"strokes: got shape {list(strokes.shape)}; give [n, 4], a row x0, y0, x1, y1 for each push")
+    return _rollout(scene, height, strokes, rules)
+
+
+def step_batch(
+    scene: Scene,
+    height: jax.typing.ArrayLike,
+    stroke: jax.typing.ArrayLike,
+    *,
+    push: SteppedPush | None = None,
+    scheme: Relaxation | None = None,
+    stop: Stop | None = None,
+    chunk: int = 64,
+) -> Shaped:
+    """`step` on a batch of maps [B, H, W] and strokes [B, 4] of one scene; every field of the result gains the batch axis.
+
+    Like `settle_batch`, it takes the maps in chunks and is an outermost program.
+    """
+    height = as_batch(height)
+    stroke = jnp.asarray(stroke, height.dtype)
+    if stroke.shape != (height.shape[0], 4):
+        raise ValueError(f"stroke: got shape {list(stroke.shape)}; give [{height.shape[0]}, 4], one stroke for each map")
+    check_chunk(chunk)
+    scene, _, rules = _ready(scene, height[0], push, scheme, stop)
+    return _step_program()(scene, height, stroke.reshape(-1, 2, 2), rules, chunk=min(chunk, height.shape[0]))
+
+
+class OutcomeError(RuntimeError):
+    """A result that is not clean; its message says what to do."""
+
+
+_ADVICE = {
+    Outcome.NOT_STILL: (
+        "the sand is not still ({residual:.2g} in slope above repose after {sweeps} sweeps): raise the stop rule's bound or "
+        "tolerance, or, where heights are large against the spacing, subtract their mean or use float64"
+    ),
+    Outcome.WINDOW_EDGE: "sand moved at the window's edge while the tool was down: enlarge Window(size) or use Whole()",
+    Outcome.NOT_FINITE: "the map or the stroke holds a NaN or an infinity: look for it with numpy.isfinite",
+}
+
+
+def check(result: Settled) -> None:
+    """Raises `OutcomeError`, with advice, if the outcome of a result (or of any in a batch) is not clean. Host side."""
+    outcome = concrete(result.outcome)
+    if outcome is None:
+        raise ValueError("result: got a traced value; call check outside jit, vmap and grad")
+    bad = np.flatnonzero(outcome.ravel())
+    if not bad.size:
+        return
+    first = bad[0]
+    code = Outcome(int(outcome.ravel()[first]))
+    detail = {
+        "residual": float(np.ravel(result.residual)[first]),
+        "sweeps": int(np.broadcast_to(result.sweeps, outcome.shape).ravel()[first]),
+    }
+    where = f"{bad.size} of {outcome.size} maps, first {int(first)}: " if outcome.ndim else ""
+    raise OutcomeError(where + "; ".join(_ADVICE[bit].format(**detail) for bit in code))
+
+
+_Rules = tuple[SteppedPush, Relaxation, Stop]
+
+
+def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, _Rules]:
+    push = SteppedPush() if push is None else push
+    if not isinstance(push, SteppedPush):
+        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps)")
+    if not 0 < push.substep <= 1:
+        raise ValueError(f"push.substep: got {push.substep!r}; give a part of a spacing, above 0 and at most 1")
+    if isinstance(push.sweeps, bool) or not isinstance(push.sweeps, int) or push.sweeps < 0:
+        raise ValueError(f"push.sweeps: got {push.sweeps!r}; give a whole number of at least 0")
+    check_rule(scene, Relaxation(push.rate), None)
+    scheme, stop = check_rule(scene, scheme, stop)
+    scene, height = fit(scene, height)
+    return scene, height, cast((push, scheme, stop), height.dtype)
+
+
+def _stroke(stroke: Any, dtype: Any) -> jax.Array:
+    stroke = jnp.asarray(stroke, dtype)
+    if stroke.shape != (4,):
+        remedy = "use jax.vmap" if stroke.ndim > 1 and stroke.shape[-1] == 4 else "give x0, y0, x1, y1 in metres"
+        raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
+    return stroke.reshape(2, 2)
+
+
+def _path(path: Any, dtype: Any) -> jax.Array:
+    path = jnp.asarray(path, dtype)
+    if path.ndim != 2 or path.shape[0] < 2 or path.shape[1] != 2:
+        remedy = "use jax.vmap" if path.ndim > 2 else "give at least two points [n, 2] of x, y in metres"
+        raise ValueError(f"path: got shape {list(path.shape)}; {remedy}")
+    return path
+
+
+def _itself(height: jax.Array) -> jax.Array:
+    return height
+
+
+@partial(jax.jit, static_argnames="record")
+def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, record: Any = None) -> tuple[Shaped, Any]:
+    push, scheme, stop = rules
+    pushed, frames = push_along(scene, height, path, push, record)
+    settled = relax(scene, pushed.height, scheme, stop)
+    outcome = settled.outcome | Outcome.WINDOW_EDGE * pushed.window_edge | Outcome.NOT_FINITE * pushed.not_finite
+    settled = replace(settled, outcome=outcome, drained=settled.drained + pushed.drained)
+    return Shaped(**vars(settled), pose=pushed.pose), frames
+
+
+@jax.jit
+def _act(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules) -> Pushed:
+    return push_along(scene, height, path, rules[0])[0]
+
+
+@jax.jit
+def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: _Rules) -> Shaped:
+    def one(height: jax.Array, stroke: jax.Array) -> tuple[jax.Array, Shaped]:
+        shaped, _ = _follow(scene, height, stroke.reshape(2, 2), rules)
+        return shaped.height, shaped
+
+    return jax.lax.scan(one, height, strokes)[1]
+
+
+def _step_chunks(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, *, chunk: int) -> Shaped:
+    return jax.lax.map(lambda pair: _follow(scene, *pair, rules)[0], (height, path), batch_size=chunk)
+
+
+@cache
+def _step_program() -> Any:
+    return jax.jit(_step_chunks, static_argnames="chunk", compiler_options=wide_vectors())

@@ -1,0 +1,71 @@
+"""Where the sand settles while the tool moves."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Whole:
+    """Everywhere (neutral)."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Window:
+    """In a block of `size` cells (rows, columns) that follows the tool.
+
+    If a cell within two cells of the block's edge (where that is not the map's) moves by more than `tolerance` spacings
+    while the tool advances by one sub-step, the outcome says WINDOW_EDGE: the result may then differ from that of `Whole`.
+    With tolerance 0 and no such outcome the two are equal to the last bit.
+    """
+
+    size: tuple[int, int] = field(metadata={"static": True})
+    tolerance: jax.Array | float = 1e-3
+
+
+Origin = list[jax.Array]
+
+
+def origin(window: Window, shape: tuple[int, int], centre: tuple[jax.Array, jax.Array]) -> Origin:
+    """First row and column of the block around `centre` (row, column), moved to lie on the map."""
+    return [
+        jnp.clip(jnp.floor(c).astype(jnp.int32) - n // 2, 0, m - n)
+        for c, n, m in zip(centre, window.size, shape, strict=True)
+    ]
+
+
+def cut(window: Window, shape: tuple[int, int], start: Origin, tree: Any) -> Any:
+    """The block of every map in a tree: [H, W], [1, W], [H, 1], or with a halo [H + 2, W + 2]. Scalars stay."""
+
+    def one(a: jax.Array) -> jax.Array:
+        if a.ndim < 2:
+            return a
+        first = [0 if m == 1 else o for o, m in zip(start, a.shape, strict=True)]
+        sizes = [1 if m == 1 else m - n + w for m, n, w in zip(a.shape, shape, window.size, strict=True)]
+        return lax.dynamic_slice(a, first, sizes)
+
+    return jax.tree.map(one, tree)
+
+
+def paste(start: Origin, tree: Any, blocks: Any) -> Any:
+    """The maps of a tree with their blocks replaced."""
+    return jax.tree.map(lambda a, b: lax.dynamic_update_slice(a, b, start), tree, blocks)
+
+
+def edge_movement(
+    window: Window, shape: tuple[int, int], start: Origin, old: jax.Array, new: jax.Array, cover: jax.Array
+) -> jax.Array:
+    """The largest change of height within two cells of the block's edge where that is not the map's; infinite if the tool
+    covers a part of it."""
+    near = []
+    for o, n, m in zip(start, window.size, shape, strict=True):
+        i = jnp.arange(n)
+        near.append(((i < 2) & (o > 0)) | ((i >= n - 2) & (o + n < m)))
+    change = jnp.where(new == old, 0, jnp.abs(new - old))
+    change = jnp.where(jnp.isnan(new), 0, jnp.where(cover > 0, jnp.inf, change))
+    return lax.stop_gradient(jnp.max(jnp.where(near[0][:, None] | near[1][None, :], change, 0)))
