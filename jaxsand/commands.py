@@ -98,10 +98,10 @@ def _target(options: argparse.Namespace) -> "Target":
     start = _cell(options.start)
     if len(name) == 1:
         dig, own = goals.letter_map(name.upper() if name.isascii() else name)
-        return shaping.map_target(dig, _start(options.start, start, own), name.upper(), _layout(options))
+        return shaping.map_target(dig, start if options.start else own, name.upper(), _layout(options))
     if suffix == ".txt":
-        dig, own = goals.read_text_map(read_text(path), str(path))
-        return shaping.map_target(dig, _start(options.start, start, own), path.stem, _layout(options))
+        dig, marked = goals.read_text_map(read_text(path), str(path))
+        return shaping.map_target(dig, start if options.start else marked, path.stem, _layout(options))
     if options.start:
         raise ValueError(f"start: {name} is no map of # and .; leave --start out")
     if suffix == ".png":
@@ -204,12 +204,13 @@ def run_plan(options: argparse.Namespace) -> None:
     from jaxsand.planner import plan
 
     start = _cell(options.start)
+    own: tuple[int, int] | None
     if len(options.map) == 1:
         dig, own = goals.letter_map(options.map.upper())
     else:
         dig, own = goals.read_text_map(read_text(Path(options.map)), options.map)
     began = time.perf_counter()
-    found = plan(dig, _start(options.start, start, own))
+    found = plan(dig, start if options.start else own)
     report = {
         "steps": found.steps,
         "path": found.path,
@@ -224,10 +225,10 @@ def run_plan(options: argparse.Namespace) -> None:
     _print(options, report, _lines)
 
 
-def run_layout(options: argparse.Namespace) -> None:
+def run_benchmark(options: argparse.Namespace) -> None:
     tell = progress()
     out = folder(options.out) if options.out else None
-    from jaxsand.bench import bench, table
+    from jaxsand.benchmark import bench, table
 
     report = bench(options.what, options.batch, tell)
     if out:
@@ -245,10 +246,6 @@ def _cell(text: str | None) -> tuple[int, int] | None:
     except ValueError:
         raise ValueError(f"start: got {text!r}; give row,column such as 3,3, or best") from None
     return row, column
-
-
-def _start(given: str | None, cell: tuple[int, int] | None, own: tuple[int, int] | None) -> tuple[int, int] | None:
-    return own if given is None else cell
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any], human: Callable[[dict[str, Any]], str]) -> None:

@@ -175,13 +175,14 @@ def _advance(push: SteppedPush, params: Any, k: jax.Array, state: _State) -> _St
     def move(job: Job, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost, jax.Array]:
         before = coverage(job.tool, pose, job.x, job.y, job.bed.spacing)
         swept = coverage(job.tool, pose, job.x, job.y, job.bed.spacing, ahead)
+        contact = _contact(job, swept, h)
         h, carried = take(job, h, before, swept)
         straight = jnp.maximum(jnp.abs(pose.cos), jnp.abs(pose.sin))
         share = shares(pose.cos / straight, pose.sin / straight)
         for _ in range(2):
             h, lost, carried = pass_on(job, share, 1 - swept, h, lost, carried)
         after = coverage(job.tool, end, job.x, job.y, job.bed.spacing)
-        flow = Flow(job.flow.rate * (ahead / substep), job.flow.quantum)
+        flow = Flow(job.flow.rate * (contact * ahead / substep), job.flow.quantum)
         h, lost = _settle_around(job, flow, push.sweeps, after, h + carried, lost)
         return h, lost, swept
 
@@ -194,13 +195,24 @@ def _lower(scene: Scene, push: SteppedPush, job: Job, pose: Pose, before: Pose |
     def move(job: Job, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost, jax.Array]:
         cover = coverage(job.tool, pose, job.x, job.y, job.bed.spacing)
         old = coverage(job.tool, before, job.x, job.y, job.bed.spacing) if before else jnp.zeros_like(cover)
+        contact = _contact(job, cover, h)
         h, carried = take(job, h, old, jnp.maximum(cover, old))
         h, lost = spread(job, radial(job, pose), 1 - cover, h, lost, carried)
         if before is None:  # as many sweeps as for one spacing of travel
-            h, lost = _settle_around(job, job.flow, math.ceil(push.sweeps / push.substep), cover, h, lost)
+            flow = Flow(job.flow.rate * contact, job.flow.quantum)
+            h, lost = _settle_around(job, flow, math.ceil(push.sweeps / push.substep), cover, h, lost)
         return h, lost, cover
 
     return _in_window(scene, job, pose, state, move)
+
+
+def _contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
+    """1 while the blade is among the sand, falling to 0 where it covers no cell or hangs a spacing above all it covers.
+
+    Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
+    """
+    near = jnp.clip(1 + (h - job.bottom) / job.bed.spacing, 0, 1)
+    return jnp.minimum(1, 2 * jnp.max(jnp.where(jnp.isnan(h), 0, near) * cover))
 
 
 def _settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:

@@ -47,8 +47,8 @@ class Relaxation:
     """The paper's sweep (arXiv:1908.02745, Eq. 1-2) with flow rate k = rate dx^2; first order in the rate.
 
     With 8 neighbours it is stable for rate < 1/4.83 and a convex combination of neighbouring heights (no overshoot: the
-    highest point never rises, the lowest never falls) up to 1/6.83; with 4 neighbours for both up to 1/4. The default is the
-    paper's dx^2/8. The settled map depends slightly on the rate.
+    highest point never rises, the lowest never falls) up to 1/6.83; with 4 neighbours for both up to 1/4, on a map of one
+    row or column up to 1/2. The default is the paper's dx^2/8. The settled map depends slightly on the rate.
     """
 
     rate: jax.Array | float = 0.125
@@ -152,7 +152,7 @@ def check_rule(scene: Scene, scheme: Relaxation | None, stop: Stop | None) -> tu
     if not isinstance(scheme, Relaxation):
         raise ValueError(f"scheme: got {scheme!r}; give Relaxation(rate)")
     rate = concrete(scheme.rate)
-    limit = {4: 1 / 4, 8: 1 / (2 + 2 * 2**0.5)}[scene.grid.neighbours]
+    limit = _stable_rate(scene)
     if rate is not None and not (rate > 0).all():
         raise ValueError(f"scheme.rate: got {scheme.rate!r}; give a positive share such as 0.125")
     if rate is not None and not (rate <= limit).all():
@@ -168,6 +168,13 @@ def check_rule(scene: Scene, scheme: Relaxation | None, stop: Stop | None) -> tu
     if tolerance is not None and not (tolerance >= 0).all():
         raise ValueError(f"stop.tolerance: got {stop.tolerance!r}; give a slope of 0 or more, such as 1e-3")
     return scheme, stop
+
+
+def _stable_rate(scene: Scene) -> float:
+    """The rate above which the checkerboard (in one dimension: the saw-tooth) grows."""
+    if 1 in scene.grid.shape:
+        return 1 / 2
+    return {4: 1 / 4, 8: 1 / (2 + 2 * 2**0.5)}[scene.grid.neighbours]
 
 
 def as_batch(height: jax.typing.ArrayLike) -> jax.Array:

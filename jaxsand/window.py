@@ -21,7 +21,7 @@ class Window:
 
     If a cell within two cells of the block's edge (where that is not the map's) moves by more than `tolerance` spacings
     while the tool advances by one sub-step, the outcome says WINDOW_EDGE: the result may then differ from that of `Whole`.
-    With tolerance 0 and no such outcome the two are equal to the last bit.
+    With tolerance 0 and no such outcome the two are equal up to the rounding of single operations.
     """
 
     size: tuple[int, int] = field(metadata={"static": True})
@@ -45,7 +45,7 @@ def cut(window: Window, shape: tuple[int, int], start: Origin, tree: Any) -> Any
     def one(a: jax.Array) -> jax.Array:
         if a.ndim < 2:
             return a
-        first = [0 if m == 1 else o for o, m in zip(start, a.shape, strict=True)]
+        first = [jnp.zeros_like(o) if m == 1 else o for o, m in zip(start, a.shape, strict=True)]
         sizes = [1 if m == 1 else m - n + w for m, n, w in zip(a.shape, shape, window.size, strict=True)]
         return lax.dynamic_slice(a, first, sizes)
 

@@ -1,0 +1,81 @@
+"""A window gives what settling everywhere gives, or says that it may not.
+
+The two are the same operations on the same numbers, but compiled apart, and the compiler may contract a product and a sum
+into one rounding here and not there. So "the same" is to a few units in the last place.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsand as js
+
+from .conftest import ANGLE
+
+SHAPE = (72, 80)
+ROUNDING = 3e-16
+DX = 0.01
+
+
+def sand(window=None, **parts):
+    return js.make_scene(SHAPE, DX, ANGLE, tool=js.Blade(0.02, 0.015, 0.0075), window=window, **parts)
+
+
+def test_equal_or_flagged():
+    strokes = jnp.asarray(np.random.default_rng(0).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (12, 4)))
+    whole = jax.vmap(lambda s: js.act(sand(), jnp.zeros(SHAPE), s).height)(strokes)
+    exact = {}
+    for size in ((12, 12), (28, 28), (56, 56), (72, 80)):
+        window = js.Window(size, tolerance=0.0)
+        out = jax.vmap(lambda s, w=window: js.act(sand(w), jnp.zeros(SHAPE), s))(strokes)
+        same = [bool(np.abs(a - b).max() < ROUNDING) for a, b in zip(out.height, whole, strict=True)]
+        flagged = [bool(f) for f in out.window_edge]
+        assert all(s or f for s, f in zip(same, flagged, strict=True))
+        exact[size] = (sum(same), sum(flagged))
+    assert exact[12, 12][1] >= 11  # too small: said
+    assert exact[12, 12][0] < 6
+    assert exact[56, 56] == (12, 0)  # large enough: the same maps
+    assert exact[72, 80] == (12, 0)
+
+
+def test_the_default_tolerance_keeps_the_difference_small():
+    strokes = jnp.asarray(np.random.default_rng(1).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (8, 4)))
+    whole = jax.vmap(lambda s: js.step(sand(), jnp.zeros(SHAPE), s).height)(strokes)
+    out = jax.vmap(lambda s: js.step(sand(js.Window((36, 36))), jnp.zeros(SHAPE), s))(strokes)
+    clean = np.asarray(out.outcome) == 0
+    assert clean.any()
+    assert np.abs(np.asarray(out.height) - np.asarray(whole))[clean].max() < 0.01 * 0.0075
+
+
+def test_an_unsettled_map_is_flagged():
+    rough = np.random.default_rng(2).uniform(-0.05, 0.05, SHAPE)
+    assert bool(js.act(sand(js.Window((56, 56))), rough, (0.3, 0.3, 0.5, 0.4)).window_edge)
+
+
+def test_a_window_at_the_map_edge_with_everything_in_it():
+    """Windows cut walls, angles and draining edges as well."""
+    solid = np.zeros(SHAPE, bool)
+    solid[30:34, 40:44] = True
+    angle = np.full(SHAPE, ANGLE)
+    angle[:, 40:] = 0.6
+    parts = {"walls": js.Walls(solid), "edge": js.Draining(0.0)}
+    stroke = (0.05, 0.05, 0.5, 0.3)
+
+    def run(window):
+        scene = js.make_scene(SHAPE, DX, angle, tool=js.Blade(), window=window, **parts)
+        return js.act(scene, np.zeros(SHAPE), stroke)
+
+    whole, window = run(None), run(js.Window((60, 60), tolerance=0.0))
+    assert not bool(window.window_edge)
+    assert np.abs(whole.height - window.height).max() < ROUNDING
+    assert float(whole.drained) == pytest.approx(float(window.drained), rel=1e-9, abs=1e-15)
+
+
+def test_one_row_and_one_column():
+    for shape, stroke in (((1, 40), (0.1, 0.005, 0.3, 0.005)), ((40, 1), (0.005, 0.1, 0.005, 0.3)), ((1, 1), (0, 0, 0.01, 0.01))):
+        for window in (None, js.Window((min(shape[0], 30), min(shape[1], 30)))):
+            scene = js.make_scene(shape, DX, ANGLE, tool=js.Blade(0.02, 0.01, 0.005), window=window)
+            out = js.step(scene, np.zeros(shape), stroke)
+            assert np.all(np.isfinite(out.height))
+            assert abs(float(out.height.sum())) < 1e-12
