@@ -8,9 +8,9 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "DRY_SAND": "material",
     "Blade": "tool",
     "Closed": "walls",
+    "DRY_SAND": "material",
     "Draining": "walls",
     "Grid": "grid",
     "Material": "material",

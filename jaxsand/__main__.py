@@ -84,10 +84,10 @@ class _Parser(argparse.ArgumentParser):
     """Mistakes become one line `error: field: what; remedy` and exit code 2."""
 
     def error(self, message: str) -> NoReturn:
-        field, _, what = message.removeprefix("argument ").partition(": ")
-        if not what:
-            field, what = "arguments", message
-        field = field.split("/")[-1].removeprefix("--")
+        field, what = "arguments", message
+        if message.startswith("argument "):
+            field, _, what = message.removeprefix("argument ").partition(": ")
+            field = field.split("/")[-1].removeprefix("--")
         raise SystemExit(_fail(f"{field}: {what}; see {self.prog} --help"))
 
 

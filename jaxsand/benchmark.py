@@ -91,7 +91,7 @@ def bench_push(batch: int, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
     """Random pushes of the default blade on level sand, with and without settling afterwards."""
     scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
     near = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade(), window=Window((16, 16)))
-    level, strokes = jnp.zeros((batch, _CELLS, _CELLS)), _strokes(batch)
+    level, strokes = jnp.zeros((batch, _CELLS, _CELLS), jnp.float32), _strokes(batch)
     act_all = jax.jit(jax.vmap(lambda s: act(scene, level[0], s).height))
     one = jax.jit(lambda s: step(scene, level[0], s).height)
     ways = {
@@ -155,7 +155,7 @@ def _compare(rows: list[dict[str, Any]], rival: str, figure: str, name: str, *, 
 
 def _pushed(batch: int) -> tuple[Scene, jax.Array]:
     scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
-    level = jnp.zeros((_CELLS, _CELLS))
+    level = jnp.zeros((_CELLS, _CELLS), jnp.float32)
     pushed = jax.jit(lambda s: jax.lax.map(lambda one: act(scene, level, one).height, s, batch_size=64))(_strokes(batch))
     return make_scene((_CELLS, _CELLS), _SPACING, _ANGLE), jax.block_until_ready(pushed)
 
@@ -163,7 +163,7 @@ def _pushed(batch: int) -> tuple[Scene, jax.Array]:
 def _strokes(batch: int) -> jax.Array:
     """Random strokes between points of the middle four fifths of the map (m)."""
     side = _CELLS * _SPACING
-    return jax.random.uniform(jax.random.key(0), (batch, 4), minval=0.1 * side, maxval=0.9 * side)
+    return jax.random.uniform(jax.random.key(0), (batch, 4), jnp.float32, minval=0.1 * side, maxval=0.9 * side)
 
 
 def _cores() -> int:

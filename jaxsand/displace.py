@@ -38,7 +38,7 @@ def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[j
     """Takes up the sand that has to leave as the cover grows: the height left and the height taken."""
     open_before = 1 - before
     shut = open_before < SHUT
-    share = jnp.where(shut, 1, (cover - before) / jnp.where(shut, 1, open_before))
+    share = jnp.where(shut, 1, jnp.clip((cover - before) / jnp.where(shut, 1, open_before), 0, 1))
     taken = _whole(job, share * jnp.where(h > job.bottom, h - job.bottom, 0))
     return h - taken, taken
 

@@ -109,7 +109,7 @@ def text_strokes(text: str) -> np.ndarray:
         raise ValueError(f"text: {text!r} needs the Hershey fonts; run pip install 'jaxsand[letters]'") from None
     font = HersheyFonts()
     font.load_default_font("rowmans")
-    lines = np.array([[*a, *b] for a, b in font.lines_for_text(text)], float)
+    lines = np.array([[a[0], -a[1], b[0], -b[1]] for a, b in font.lines_for_text(text)], float)
     if not lines.size:
         raise ValueError(f"text: got {text!r}, which has no strokes; give letters, digits or signs")
     points = lines.reshape(-1, 2, 2)

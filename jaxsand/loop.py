@@ -153,6 +153,6 @@ def _first_order(tree: Tree) -> Tree:
 @_first_order.defjvp
 def _refuse(primals: Tree, tangents: Tree) -> Tree:
     raise NotImplementedError(
-        "second derivatives through a settling or pushing loop are not available; "
-        "differentiate once, or settle with stop=Sweeps(n), which is differentiable twice"
+        "second derivatives through settling or pushing are not available; differentiate once, "
+        "and take differences of gradients where a second derivative is needed"
     )

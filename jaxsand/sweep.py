@@ -24,7 +24,7 @@ from jaxsand.scene import Scene
 from jaxsand.walls import Draining, Walls
 
 Lost = jax.Array | None
-SHUT = 1e-3  # an open share of a cell below this counts as none
+SHUT = 1e-6  # an open share of a cell below this counts as none
 
 
 @jax.tree_util.register_dataclass
@@ -210,7 +210,10 @@ def _over(bed: Bed, rim: Rim, h: jax.Array) -> jax.Array:
 
 @jax.custom_jvp
 def truncate(x: jax.Array) -> jax.Array:
-    """Towards zero to a whole number; its derivative is taken to be that of the identity."""
+    """Towards zero to a whole number; its derivative is taken to be that of the identity.
+
+    Reverse mode forgets such a rule after the first derivative: loops that use it must refuse a second one (loop.py does).
+    """
     return jnp.trunc(x)
 
 

@@ -61,7 +61,7 @@ def test_at_a_reversal_the_heap_stays_behind_and_the_trench_is_cleaned():
     assert h[row, int(0.28 / DX)] == pytest.approx(float(once.height[row, int(0.28 / DX)]), abs=1e-3)
     assert h[row, int(0.075 / DX)] > 0.001  # what the way back pushed out at the start
     middle = np.s_[:, int(0.13 / DX) : int(0.22 / DX)]
-    assert (h[middle] < -0.0025).sum() > (np.asarray(once.height)[middle] < -0.0025).sum()
+    assert np.minimum(h[middle], 0).sum() < 1.01 * np.minimum(np.asarray(once.height)[middle], 0).sum()
     assert float(out.pose.cos) == pytest.approx(-1)
 
 

@@ -238,7 +238,9 @@ def test_vmap_equals_a_loop_over_maps_strokes_and_tools():
     sand = js.make_scene((24, 24), 0.01, ANGLE, tool=js.Blade())
     rng = np.random.default_rng(5)
     strokes = rng.uniform(0.02, 0.22, (5, 4)).astype(np.float32)
-    maps = np.stack([np.asarray(js.settle(sand, m).height) for m in rng.uniform(-0.01, 0.01, (5, 24, 24)).astype(np.float32)])
+    maps = np.stack(
+        [np.asarray(js.settle(sand, m).height) for m in rng.uniform(-0.01, 0.01, (5, 24, 24)).astype(np.float32)]
+    )
     loop = [js.step(sand, h, s) for h, s in zip(maps, strokes, strict=True)]
     for many in (jax.vmap(lambda h, s: js.step(sand, h, s))(maps, strokes), js.step_batch(sand, maps, strokes, chunk=2)):
         for i, one in enumerate(loop):
@@ -246,8 +248,8 @@ def test_vmap_equals_a_loop_over_maps_strokes_and_tools():
             assert np.allclose(many.height[i], one.height, atol=2e-6)
             assert int(many.outcome[i]) == 0
     depths = jnp.array([0.002, 0.0075], jnp.float32)
-    deep = jax.vmap(lambda d: js.step(js.make_scene((24, 24), 0.01, ANGLE, tool=js.Blade(depth=d)), maps[0], strokes[0]).height)(
-        depths
-    )
+    deep = jax.vmap(
+        lambda d: js.step(js.make_scene((24, 24), 0.01, ANGLE, tool=js.Blade(depth=d)), maps[0], strokes[0]).height
+    )(depths)
     assert np.allclose(deep[1], loop[0].height, atol=2e-6)
     assert not np.allclose(deep[0], deep[1], atol=1e-4)

@@ -73,7 +73,11 @@ def test_a_window_at_the_map_edge_with_everything_in_it():
 
 
 def test_one_row_and_one_column():
-    for shape, stroke in (((1, 40), (0.1, 0.005, 0.3, 0.005)), ((40, 1), (0.005, 0.1, 0.005, 0.3)), ((1, 1), (0, 0, 0.01, 0.01))):
+    for shape, stroke in (
+        ((1, 40), (0.1, 0.005, 0.3, 0.005)),
+        ((40, 1), (0.005, 0.1, 0.005, 0.3)),
+        ((1, 1), (0, 0, 0.01, 0.01)),
+    ):
         for window in (None, js.Window((min(shape[0], 30), min(shape[1], 30)))):
             scene = js.make_scene(shape, DX, ANGLE, tool=js.Blade(0.02, 0.01, 0.005), window=window)
             out = js.step(scene, np.zeros(shape), stroke)

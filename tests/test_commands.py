@@ -1,0 +1,218 @@
+"""The command line as a user meets it: files, JSON, exit codes, and one line for every mistake."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxsand.__main__ import main
+from jaxsand.task import volume_error
+
+L_MAP = "#..\n#..\n###\n"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
+    (tmp_path / "l.txt").write_text(L_MAP)
+    (tmp_path / "empty.txt").write_text("")
+    (tmp_path / "level.txt").write_text("...\n...\n")
+    (tmp_path / "apart.txt").write_text("#.#\n")
+    (tmp_path / "ragged.txt").write_text("##\n#\n")
+    (tmp_path / "odd.txt").write_text("#x\n")
+    (tmp_path / "twostarts.txt").write_text("SS\n")
+    (tmp_path / "binary.txt").write_bytes(bytes(range(128, 256)))
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
+    (tmp_path / "broken.npy").write_bytes(b"rubbish")
+    (tmp_path / "a-file").write_text("")
+    np.save(tmp_path / "cube.npy", np.zeros((2, 2, 2)))
+    np.save(tmp_path / "flat.npy", np.zeros((12, 12), np.float32))
+    np.save(tmp_path / "nan.npy", np.full((12, 12), np.nan))
+    np.save(tmp_path / "small.npy", -np.ones((3, 3)))
+    np.save(tmp_path / "words.npy", np.array([["a"]]))
+    np.save(tmp_path / "pile.npy", np.eye(12, dtype=np.float32) * 0.05)
+    Image.new("L", (30, 20), 255).save(tmp_path / "white.png")
+    return tmp_path
+
+
+BAD = {
+    "no command": ([], "arguments: "),
+    "unknown command": (["dig"], "COMMAND: invalid choice: 'dig'"),
+    "no goal": (["shape"], "arguments: .*goal"),
+    "unknown option": (["shape", "S", "--deep"], "arguments: unrecognized arguments: --deep"),
+    "unknown letter": (["shape", "é"], "letter: got 'é'"),
+    "unknown sign": (["shape", "?"], "letter: got '\\?'"),
+    "a word": (["shape", "SAND"], "goal: got 'SAND'.*--method strokes"),
+    "nothing": (["shape", " "], "goal: got an empty name"),
+    "missing map": (["shape", "none.txt"], "none.txt: no such file"),
+    "missing picture": (["shape", "none.png"], "none.png: no such file"),
+    "missing heights": (["shape", "none.npy"], "none.npy: no such file"),
+    "empty map": (["shape", "empty.txt"], "empty.txt: got no rows"),
+    "level map": (["shape", "level.txt"], "level.txt: got no cell to dig"),
+    "map in pieces": (["shape", "apart.txt"], "map: got 2 pieces"),
+    "ragged map": (["shape", "ragged.txt"], "ragged.txt: got 1 cells in row 2"),
+    "odd sign": (["shape", "odd.txt"], "odd.txt: got 'x' in row 1"),
+    "two starts": (["shape", "twostarts.txt"], "twostarts.txt: got 2 starts"),
+    "binary map": (["shape", "binary.txt"], "binary.txt: cannot be read as text"),
+    "broken picture": (["shape", "broken.png"], "broken.png: cannot be read as a picture"),
+    "white picture": (["shape", "white.png"], "goal: .*nothing to dig"),
+    "broken heights": (["shape", "broken.npy"], r"broken.npy: cannot be read as a \.npy"),
+    "cube of heights": (["shape", "cube.npy"], r"cube.npy: got shape \[2, 2, 2\]"),
+    "level heights": (["shape", "flat.npy"], "goal: .*nothing to dig"),
+    "heights not finite": (["shape", "nan.npy"], "goal: .*(not finite|nothing to dig)"),
+    "too few heights": (["shape", "small.npy"], "goal: .*fewer than the 6"),
+    "start off the letter": (["shape", "S", "--start", "0,0"], r"start: got \(0, 0\)"),
+    "start of one number": (["shape", "S", "--start", "3"], "start: got '3'"),
+    "start for a picture": (["shape", "white.png", "--start", "1,1"], "start: .*leave --start out"),
+    "unknown method": (["shape", "S", "--method", "magic"], "method: invalid choice: 'magic'"),
+    "strokes of a map": (["shape", "l.txt", "--method", "strokes"], "method: 'strokes'"),
+    "spacing of words": (["shape", "S", "--spacing", "fine"], "spacing: got 'fine'"),
+    "negative spacing": (["shape", "S", "--spacing", "-1"], "spacing: got -1.0"),
+    "depth of none": (["shape", "S", "--depth-mm", "0"], "depth-mm: got 0.0"),
+    "resolution of none": (["shape", "S", "--resolution", "0"], "resolution: got '0'"),
+    "resolution beyond reason": (["shape", "S", "--resolution", "9999"], "resolution: got 9999"),
+    "unknown surface": (["shape", "S", "--surface", "moon"], "surface: got 'moon'"),
+    "surface of another size": (["shape", "S", "--surface", "flat.npy"], r"surface: got shape \[12, 12\]"),
+    "folder under a file": (["shape", "S", "--out", "a-file/x"], "out: cannot write to a-file/x"),
+    "no out file": (["settle", "pile.npy"], "arguments: .*--out-file"),
+    "out file of another kind": (["settle", "pile.npy", "--out-file", "x.txt"], "out-file: got x.txt"),
+    "no input": (["settle", "none.npy", "--out-file", "x.npy"], "none.npy: no such file"),
+    "words to settle": (["settle", "words.npy", "--out-file", "x.npy"], "words.npy: got dtype"),
+    "nan to settle": (["settle", "nan.npy", "--out-file", "x.npy"], "nan.npy: got 144 cells that are not finite"),
+    "right angle": (["settle", "pile.npy", "--out-file", "x.npy", "--repose-deg", "90"], "repose_angle: "),
+    "six neighbours": (["settle", "pile.npy", "--out-file", "x.npy", "--neighbours", "6"], "neighbours: invalid choice"),
+    "spacing zero": (["settle", "pile.npy", "--out-file", "x.npy", "--spacing", "0"], "spacing: got 0.0"),
+    "tolerance below zero": (["settle", "pile.npy", "--out-file", "x.npy", "--tol", "-1"], r"stop\.tolerance: got"),
+    "unwritable folder": (["settle", "pile.npy", "--out-file", "a-file/x.npy"], "out: cannot write to a-file"),
+    "plan of nothing": (["plan", "none.txt"], "none.txt: no such file"),
+    "plan in pieces": (["plan", "apart.txt"], "map: got 2 pieces"),
+    "unknown benchmark": (["bench", "everything"], "what: invalid choice"),
+    "batch of none": (["bench", "settle", "--batch", "0"], "batch: got '0'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line_and_exit_code_2(here, capsys, name):
+    arguments, message = BAD[name]
+    before = sorted(here.iterdir())
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    out, err = capsys.readouterr()
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    import re
+
+    assert re.match(f"error: {message}", err), err
+    new = set(here.iterdir()) - set(before)
+    assert not [p for p in new if p.is_file()]
+
+
+def run(*arguments, **options):
+    environment = os.environ | {"PYTHONWARNINGS": "error"}
+    return subprocess.run(
+        [sys.executable, "-m", "jaxsand", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        **options,
+    )
+
+
+def test_shape_writes_its_report_and_pictures(here):
+    done = run("shape", "l.txt", "--out", "out", "--json", "--resolution", "5", cwd=here)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    report = json.loads(done.stdout)
+    assert json.loads((here / "out" / "result.json").read_text()) == report
+    assert report["goal"] == "l"
+    assert (report["goal_kind"], report["method"], report["lifted"]) == ("map", "plan", False)
+    assert report["steps"] == len(report["strokes"]) == 4
+    for name in ("iou", "l2_reduction", "l2_reduction_with_berms", "volume_error", "max_slope_deg", "seconds"):
+        assert isinstance(report[name], float), name
+    assert report["iou"] > 0.7
+    assert report["volume_error"] <= 1e-6
+    assert sorted(Path(f).name for f in report["files"]) == ["result.json", "shape.gif", "shape.png"]
+    assert sorted(p.name for p in (here / "out").iterdir()) == ["result.json", "shape.gif", "shape.png"]
+    with Image.open(here / "out" / "shape.png") as picture:
+        assert min(picture.size) > 800
+    with Image.open(here / "out" / "shape.gif") as film:
+        assert film.n_frames == 6
+
+
+def test_settle_keeps_dtype_and_volume(here):
+    for dtype in (np.float32, np.float64):
+        heights = np.eye(12, dtype=dtype) * dtype(0.05)
+        np.save(here / "in.npy", heights)
+        done = run("settle", "in.npy", "--out-file", "out.npy", "--json", cwd=here)
+        assert done.returncode == 0, done.stderr
+        report = json.loads(done.stdout)
+        settled = np.load(here / "out.npy")
+        assert settled.dtype == dtype
+        assert report["outcome"] == "clean"
+        assert report["sweeps"] > 0
+        assert report["residual"] <= 1e-3
+        assert report["volume_error"] == volume_error(heights, settled) <= 1e-6
+
+
+def test_settle_says_when_the_map_is_not_still(here, capsys):
+    assert main(["settle", "pile.npy", "--out-file", "out.npy", "--bound", "8", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["outcome"] == "not_still"
+    assert "not still" in err
+
+
+def test_plan(here, capsys):
+    assert main(["plan", "l.txt", "--start", "0,0", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["path"], report["steps"], report["optimal"], report["lower_bound"]) == ("SSEE", 4, True, 4)
+    assert main(["plan", "S"]) == 0
+    assert "steps: 27" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("goal", ["white-S.png", "dip.npy", "terrain", "7"])
+def test_other_goals(here, capsys, goal):
+    from jaxsand.goals import letter_map
+
+    Image.fromarray(np.kron(np.where(letter_map("S")[0], 0, 255), np.ones((6, 6))).astype(np.uint8)).save(
+        here / "white-S.png"
+    )
+    y, x = np.indices((30, 36))
+    np.save(here / "dip.npy", np.where((np.abs(y - 15) < 6) & (np.abs(x - 18) < 12), -0.0075, 0))
+    method = "strokes" if goal == "7" else "plan"
+    assert main(["shape", goal, "--out", "out", "--json", "--method", method]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (
+        report["goal_kind"]
+        == {"p": "image", "d": "heights", "t": "terrain", "7": "glyph"}[goal[0] if goal[0] in "dt7" else "p"]
+    )
+    assert report["iou"] > 0.3
+    assert (here / "out" / "shape.gif").stat().st_size < 2e6
+
+
+def test_help_does_not_import_jax():
+    code = "import sys, jaxsand.__main__ as m\ntry: m.main(['--help'])\nexcept SystemExit: pass\nassert 'jax' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "shape" in done.stdout
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    from jaxsand.files import written
+
+    target = tmp_path / "result.json"
+    target.write_text("old")
+    with pytest.raises(ValueError, match="out: cannot write .*result.json"), written(target) as path:
+        path.write_text("half")
+        raise OSError(28, "No space left on device")
+    assert target.read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["result.json"]
