@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     p.set_defaults(run=run_plan)
 
     p = commands.add_parser("bench", help="speed, side by side with plain numpy and plain C")
-    p.add_argument("what", nargs="?", choices=["settle", "push", "all"], default="all")
+    p.add_argument("what", nargs="?", choices=["settle", "push", "all", "letters"], default="all")
     p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report")
     p.add_argument("--json", action="store_true", help="print one JSON object")

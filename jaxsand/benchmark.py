@@ -7,18 +7,24 @@ call less a later one.
 import math
 import os
 import platform
+import string
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand import goals
 from jaxsand.plain import compile_c, settle_numpy
+from jaxsand.push import SteppedPush
 from jaxsand.scene import Scene, make_scene
-from jaxsand.settling import Sweeps, settle, settle_batch
+from jaxsand.settling import Relaxation, Settled, Sweeps, UntilStill, settle, settle_batch
+from jaxsand.shaping import Layout, glyph_target, map_target, shape
 from jaxsand.sim import act, step, step_batch
 from jaxsand.tool import Blade
 from jaxsand.window import Window
@@ -28,87 +34,163 @@ _CELLS = 32
 _SPACING = 0.01
 _ANGLE = math.radians(29)
 _ROUNDS = 5
+_NUMPY = "numpy, one map at a time"
+_C = "C loop, one core"
 
 
 def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None) -> dict[str, Any]:
-    """The figures for `what`: settle, push or all, on maps of 32 x 32 cells."""
+    """The figures for `what`: settle, push or both (all), on maps of 32 x 32 cells; or letters."""
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
     if what in ("push", "all"):
         report["push"] = bench_push(max(1, batch // 4), tell)
+    if what == "letters":
+        report["letters"] = bench_letters(tell)
     return report
 
 
+@dataclass(frozen=True)
+class Way:
+    """One way to do the job: `call` returns the sweeps of each of its `maps` (or None) and some of the maps it made."""
+
+    call: Callable[[], tuple[Any, Any]]
+    maps: int
+    cores: int = 1
+
+
 def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixed: int = 64) -> list[dict[str, Any]]:
-    """Settling maps in which a random push has just ended."""
+    """Settling maps in which a random push has just ended.
+
+    `error` is the largest distance, over the first maps, of the settled map from the limit of small steps (float64 where
+    JAX has it switched on, rate 1/64), divided by the largest change of height.
+    """
     scene, heights = _pushed(batch)
     host = np.asarray(heights)
+    sample = min(sample, batch)
     cores = _cores()
     mu = math.tan(_ANGLE)
-    rows: list[dict[str, Any]] = []
-    device = jax.default_backend()
-    ways: dict[str, tuple[Callable[[], Any], int, int]] = {  # the call, its maps, its cores
-        f"settle_batch, {device}": (lambda: settle_batch(scene, heights).sweeps, batch, cores),
-        f"vmap(settle), {device}": (lambda: vmapped(heights), batch, cores),
-        f"settle_batch, {fixed} sweeps": (lambda: settle_batch(scene, heights, stop=Sweeps(fixed)).sweeps, batch, cores),
-        "numpy, one map at a time": (lambda: np.array([settle_numpy(h, _SPACING, mu)[1] for h in host[:sample]]), sample, 1),
+    vmapped = jax.jit(jax.vmap(partial(settle, scene)))
+
+    def ours(settled: Settled) -> tuple[Any, Any]:
+        return settled.sweeps, settled.height[:sample]
+
+    def plain() -> tuple[Any, Any]:
+        maps, sweeps = zip(*(settle_numpy(h, _SPACING, mu) for h in host[:sample]), strict=True)
+        return np.array(sweeps), np.stack(maps)
+
+    ways = {
+        "settle_batch": Way(lambda: ours(settle_batch(scene, heights)), batch, cores),
+        "settle_batch, tolerance 1e-2": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, cores),
+        "settle_batch, tolerance 1e-4": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-4))), batch, cores),
+        f"settle_batch, {fixed} sweeps": Way(lambda: ours(settle_batch(scene, heights, stop=Sweeps(fixed))), batch, cores),
+        "vmap(settle)": Way(lambda: ours(vmapped(heights)), batch, cores),
+        _NUMPY: Way(plain, sample),
     }
-    vmapped = jax.jit(jax.vmap(lambda h: settle(scene, h).sweeps))
     settle_c = compile_c()
     if settle_c is not None:
         c: Callable = settle_c
 
-        def threads(n: int, **rule: Any) -> np.ndarray:
+        def threads(n: int, **rule: Any) -> tuple[Any, Any]:
             parts = np.array_split(host.copy(), n)
             with ThreadPoolExecutor(n) as pool:
-                return np.concatenate(list(pool.map(lambda part: c(part, _SPACING, mu, **rule), parts)))
+                sweeps = np.concatenate(list(pool.map(lambda part: c(part, _SPACING, mu, **rule), parts)))
+            return sweeps, np.concatenate(parts)[:sample]
 
-        ways["C loop, one core"] = (lambda: threads(1), batch, 1)
-        ways[f"C loop, {fixed} sweeps"] = (lambda: threads(1, tolerance=-1.0, bound=fixed), batch, 1)
+        ways[_C] = Way(lambda: threads(1), batch)
+        ways[f"C loop, {fixed} sweeps"] = Way(lambda: threads(1, tolerance=-1.0, bound=fixed), batch)
         if cores > 1:
-            ways[f"C loop, {cores} cores"] = (lambda: threads(cores), batch, cores)
-    for name, (seconds, first, sweeps) in _race({n: w[0] for n, w in ways.items()}, tell).items():
-        maps, used = ways[name][1:]
-        work = float(np.sum(np.broadcast_to(sweeps, (maps,)))) * _CELLS**2
+            ways[f"C loop, {cores} cores"] = Way(lambda: threads(cores), batch, cores)
+    limit = np.asarray(settle_batch(scene, heights[:sample], scheme=Relaxation(1 / 64), stop=UntilStill(1e-5)).height, float)
+    largest = np.abs(limit - host[:sample]).max()
+    rows = []
+    for name, (seconds, first, (sweeps, maps)) in _race(ways, tell).items():
+        way = ways[name]
+        work = float(np.sum(np.broadcast_to(sweeps, (way.maps,)))) * _CELLS**2
         rows.append(
             {
                 "name": name,
-                "maps_per_second": maps / seconds,
+                "error": float(np.abs(np.asarray(maps, float) - limit).max() / largest),
+                "maps_per_second": way.maps / seconds,
                 "ns_per_cell_sweep": seconds / work * 1e9,
-                "core_ns_per_cell_sweep": seconds * used / work * 1e9,
+                "core_ns_per_cell_sweep": seconds * way.cores / work * 1e9,
                 "sweeps": float(np.mean(sweeps)),
                 "seconds": seconds,
                 "compile_seconds": max(0.0, first - seconds),
             }
         )
-    _compare(rows, "numpy, one map at a time", "maps_per_second", "times_numpy")
-    _compare(rows, "C loop, one core", "core_ns_per_cell_sweep", "speed_per_core_against_c", inverse=True)
+    _compare(rows, _NUMPY, "maps_per_second", "times_numpy")
+    _compare(rows, _C, "core_ns_per_cell_sweep", "speed_per_core_against_c", inverse=True)
     return rows
 
 
-def bench_push(batch: int, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
-    """Random pushes of the default blade on level sand, with and without settling afterwards."""
+def bench_push(batch: int, tell: Tell = lambda _: None, sample: int = 64) -> list[dict[str, Any]]:
+    """Random pushes of the default blade on level sand.
+
+    `error` is sum |h - h_ref| / sum |h_ref| over the first maps, against 64 sweeps to each quarter of a spacing.
+    """
     scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
     near = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade(), window=Window((16, 16)))
     level, strokes = jnp.zeros((batch, _CELLS, _CELLS), jnp.float32), _strokes(batch)
-    act_all = jax.jit(jax.vmap(lambda s: act(scene, level[0], s).height))
-    one = jax.jit(lambda s: step(scene, level[0], s).height)
+    vmapped = jax.jit(jax.vmap(partial(step, scene)))
+    alone = jax.jit(partial(step, scene))
+    sample = min(sample, batch)
+    few = min(16, sample)
+
+    def batched(sand: Scene, push: SteppedPush | None = None) -> Way:
+        return Way(lambda: (None, step_batch(sand, level, strokes, push=push).height[:sample]), batch, _cores())
+
     ways = {
-        "step_batch": (lambda: step_batch(scene, level, strokes).height, batch),
-        "step_batch, window 16 x 16": (lambda: step_batch(near, level, strokes).height, batch),
-        "vmap(act), not settled": (lambda: act_all(strokes), batch),
-        "step, one map at a time": (lambda: [one(s).block_until_ready() for s in strokes[:16]], 16),
+        "step_batch": batched(scene),
+        "step_batch, 2 sweeps": batched(scene, SteppedPush(0.5, 2)),
+        "step_batch, 32 sweeps": batched(scene, SteppedPush(0.5, 32)),
+        "step_batch, sub-step 1/4": batched(scene, SteppedPush(0.25, 8)),
+        "step_batch, sub-step 1": batched(scene, SteppedPush(1.0, 8)),
+        "step_batch, window 16 x 16": batched(near),
+        "vmap(step)": Way(lambda: (None, vmapped(level, strokes).height[:sample]), batch, _cores()),
+        "step, one map at a time": Way(lambda: (None, jnp.stack([alone(level[0], s).height for s in strokes[:few]])), few),
     }
+    best = np.asarray(step_batch(scene, level[:sample], strokes[:sample], push=SteppedPush(0.25, 64)).height, float)
     rows = []
-    for name, (seconds, first, _) in _race({n: w[0] for n, w in ways.items()}, tell).items():
-        maps = ways[name][1]
+    for name, (seconds, first, (_, maps)) in _race(ways, tell).items():
+        against = best[: len(maps)]
         rows.append(
             {
                 "name": name,
-                "pushes_per_second": maps / seconds,
+                "error": float(np.abs(np.asarray(maps, float) - against).sum() / np.abs(against).sum()),
+                "pushes_per_second": ways[name].maps / seconds,
                 "seconds": seconds,
                 "compile_seconds": max(0.0, first - seconds),
+            }
+        )
+    return rows
+
+
+def bench_letters(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """Every letter by the plan of its map, and by its own strokes.
+
+    A letter pushed by its own strokes is its own goal, so that row checks the plumbing.
+    """
+    rows = []
+    for letter in string.ascii_uppercase:
+        tell(f"letter {letter}")
+        dig, start = goals.letter_map(letter)
+        planned = shape(map_target(dig, start, letter, Layout()))
+        own = shape(glyph_target(goals.letter_strokes(letter), letter))
+        figures = planned.figures
+        rows.append(
+            {
+                "name": letter,
+                "steps": planned.steps,
+                "iou": figures["iou"],
+                "l2_reduction": figures["l2_reduction"],
+                "l2_reduction_with_berms": figures["l2_reduction_with_berms"],
+                "volume_error": figures["volume_error"],
+                "max_slope_deg": figures["max_slope_deg"],
+                "run_seconds": planned.seconds["run"],
+                "own_strokes": own.steps,
+                "own_iou": own.figures["iou"],
+                "own_l2_reduction": own.figures["l2_reduction"],
             }
         )
     return rows
@@ -116,33 +198,37 @@ def bench_push(batch: int, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
 
 def table(report: dict[str, Any]) -> str:
     """The report as text."""
-    lines = [f"{report['machine']}; {report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
-    for what in ("settle", "push"):
+    lines = [report["machine"]]
+    if "settle" in report or "push" in report:
+        lines.append(f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32")
+    for what in ("settle", "push", "letters"):
         rows = report.get(what)
         if not rows:
             continue
         names = [n for n in dict.fromkeys(n for row in rows for n in row) if n != "name"]
         lines.append("")
-        lines.append(f"{what:28s}" + "".join(f"{n.replace('_', ' '):>26s}" for n in names))
-        lines += [f"{row['name']:28s}" + "".join(f"{row.get(n, math.nan):26.4g}" for n in names) for row in rows]
+        first = max(len(row["name"]) for row in rows) + 2
+        wide = {n: max(10, len(n) + 2) for n in names}
+        lines.append(what.ljust(first) + "".join(n.replace("_", " ").rjust(wide[n]) for n in names))
+        lines += [row["name"].ljust(first) + "".join(f"{row[n]:{wide[n]}.4g}" for n in names) for row in rows]
     return "\n".join(lines)
 
 
-def _race(ways: dict[str, Callable[[], Any]], tell: Tell) -> dict[str, tuple[float, float, Any]]:
+def _race(ways: dict[str, Way], tell: Tell) -> dict[str, tuple[float, float, Any]]:
     """Best time, first time and result of each way, in turns."""
     first, best, result = {}, dict.fromkeys(ways, math.inf), {}
     for name, way in ways.items():
         tell(f"first call: {name}")
         began = time.perf_counter()
-        result[name] = jax.block_until_ready(way())
+        result[name] = jax.block_until_ready(way.call())
         first[name] = time.perf_counter() - began
     for turn in range(_ROUNDS):
         for name, way in ways.items():
             tell(f"round {turn + 1} of {_ROUNDS}: {name}")
             began = time.perf_counter()
-            jax.block_until_ready(way())
+            jax.block_until_ready(way.call())
             best[name] = min(best[name], time.perf_counter() - began)
-    return {name: (best[name], first[name], np.asarray(result[name])) for name in ways}
+    return {name: (best[name], first[name], result[name]) for name in ways}
 
 
 def _compare(rows: list[dict[str, Any]], rival: str, figure: str, name: str, *, inverse: bool = False) -> None:

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from typing import Literal
 
@@ -188,6 +188,8 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
     prepared = time.perf_counter()
     tell("compiling")
     longest = max(len(path) for path in target.paths)
+    if longest > 2:  # a few lengths for all paths, so that like goals share a program
+        longest = -(-longest // 32) * 32
     program = _program(scene, longest)
     compiled = time.perf_counter()
     height, frames, tools, outcome = start, [start], [_nowhere()], 0
@@ -219,6 +221,7 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
     }
 
 
+@cache
 def _program(scene: Scene, points: int) -> Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]]:
     """`follow_frames` for paths of a given number of points, compiled ahead so that its time can be told apart."""
     height = jax.ShapeDtypeStruct(scene.grid.shape, np.float32)

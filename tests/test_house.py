@@ -18,8 +18,8 @@ FLOORS = [
     {"push"},
     {"sim"},
     {"task", "goals", "planner", "plain"},
-    {"shaping", "benchmark"},
-    {"render", "files"},
+    {"shaping", "files"},
+    {"render", "benchmark"},
     {"commands"},
     {"__main__"},
 ]

@@ -51,6 +51,7 @@ def test_the_benchmark_reports_rates_that_fit_together():
         assert row["maps_per_second"] == pytest.approx(1e9 / (row["ns_per_cell_sweep"] * row["sweeps"] * cells), rel=0.01)
         assert row["compile_seconds"] >= 0
         assert row["times_numpy"] > 0
-    assert {row["name"] for row in report["push"]} >= {"step_batch", "vmap(act), not settled"}
+        assert 0 < row["error"] < 0.2
+    assert {row["name"] for row in report["push"]} >= {"step_batch", "vmap(step)"}
     text = table(report)
     assert all(row["name"] in text for row in report["settle"] + report["push"])
