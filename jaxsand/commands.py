@@ -37,7 +37,7 @@ def run_shape(options: argparse.Namespace) -> None:
         save_animation(result, path)
     report = _report(result, planned, time.perf_counter() - began, files)
     with written(files["result.json"]) as path:
-        path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        path.write_text(_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     _print(options, report, _summary)
 
@@ -233,7 +233,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
     report = bench(options.what, options.batch, tell)
     if out:
         with written(out / f"bench-{options.what}.json") as path:
-            path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+            path.write_text(_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     _print(options, report, table)
 
@@ -249,7 +249,20 @@ def _cell(text: str | None) -> tuple[int, int] | None:
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any], human: Callable[[dict[str, Any]], str]) -> None:
-    print(json.dumps(report) if options.json else human(report))
+    print(_json(report) if options.json else human(report))
+
+
+def _json(report: dict[str, Any], **layout: Any) -> str:
+    """JSON, with null for numbers that are not finite."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: plain(v) for name, v in value.items()}
+        if isinstance(value, list):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(report), allow_nan=False, **layout)
 
 
 def _lines(report: dict[str, Any]) -> str:

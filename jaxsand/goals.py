@@ -99,7 +99,9 @@ def terrain() -> np.ndarray:
 
 
 def text_strokes(text: str) -> np.ndarray:
-    """The strokes [n, 4] of any text in the unit square, y up, in Hershey's single-stroke Roman font.
+    """The strokes [n, 4] of any text, y up, in Hershey's single-stroke Roman font.
+
+    One sign fills the unit square; a longer text is 1 high and starts at x = 0.
 
     Needs the extra `letters`: pip install 'jaxsand[letters]'.
     """
@@ -114,8 +116,11 @@ def text_strokes(text: str) -> np.ndarray:
         raise ValueError(f"text: got {text!r}, which has no strokes; give letters, digits or signs")
     points = lines.reshape(-1, 2, 2)
     low = points.min((0, 1))
-    size = float(np.max(points.max((0, 1)) - low)) or 1.0
-    return ((points - low) / size + (1 - (points.max((0, 1)) - low) / size) / 2).reshape(-1, 4)
+    size = points.max((0, 1)) - low
+    if len(text.strip()) > 1:
+        return ((points - low) / (size[1] or 1.0)).reshape(-1, 4)
+    scale = size.max() or 1.0
+    return ((points - low) / scale + (1 - size / scale) / 2).reshape(-1, 4)
 
 
 @cache

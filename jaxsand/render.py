@@ -21,7 +21,8 @@ def shape_figure(result: ShapeResult) -> "Figure":
     from matplotlib.figure import Figure
 
     target, f = result.target, result.figures
-    figure = Figure(figsize=(11, 10), layout="constrained")
+    rows, columns = target.scene.grid.shape
+    figure = Figure(figsize=(11, min(max(10 * rows / columns, 5), 20)), layout="constrained")
     axes = figure.subplots(2, 2)
     goal, after = target.goal * 1e3, result.after * 1e3
     top = 2.5e3 * target.depth if target.drawn else _span(goal, after)
@@ -32,9 +33,10 @@ def shape_figure(result: ShapeResult) -> "Figure":
     span = top if target.drawn else max(_span(error), 1e-2)
     _map(axes[1, 0], error, target, "result - goal", _ERRORS, span, "difference (mm)")
     axes[1, 1].imshow(lit(result.after, float(target.scene.grid.spacing)), origin="lower", extent=_extent(target))
-    axes[1, 1].set(title="the sand, lit from the north-west", xlabel="x (m)", ylabel="y (m)")
+    axes[1, 1].set_title("the sand, lit from the north-west", loc="left")
+    axes[1, 1].set(xlabel="x (m)", ylabel="y (m)")
     figure.suptitle(
-        f"{target.name}: {result.steps} steps, IoU {f['iou']:.3f}, l2 reduction {f['l2_reduction']:.3f}, "
+        f"{target.name}: {result.steps} {'steps' if target.method == 'plan' else 'strokes'}, IoU {f['iou']:.3f}, l2 reduction {f['l2_reduction']:.3f}, "
         f"steepest slope {f['max_slope_deg']:.1f}°"
     )
     return figure
@@ -90,20 +92,22 @@ def lit(height: np.ndarray, spacing: float) -> np.ndarray:
 
 def _map(axes: "Axes", values: np.ndarray, target: Any, title: str, colours: str, top: float, label: str) -> None:
     image = axes.imshow(values, origin="lower", extent=_extent(target), cmap=colours, vmin=-top, vmax=top)
-    axes.set(title=title, xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    axes.set_title(title, loc="left")
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     over = "both" if np.abs(values).max() > top else "neither"
     axes.figure.colorbar(image, ax=axes, label=label, shrink=0.85, extend=over)
 
 
 def _path(axes: "Axes", result: ShapeResult) -> None:
+    size = 6 if len(result.target.paths) < 10 else 3
     for number, path in enumerate(result.target.paths):
         axes.plot(*path.T, "-", color="black", lw=1.2, alpha=0.7)
-        axes.plot(*path[0], "o", color="black", ms=6, label="lowered" if not number else None)
-        axes.plot(*path[-1], "s", color="black", ms=6, mfc="none", label="lifted" if not number else None)
+        axes.plot(*path[0], "o", color="black", ms=size, label="lowered" if not number else None)
+        axes.plot(*path[-1], "s", color="black", ms=size, mfc="none", label="lifted" if not number else None)
         runs = np.diff(path, axis=0)
         middle = (path[:-1] + path[1:]) / 2
         axes.quiver(*middle.T, *_unit(runs).T, angles="xy", scale=38, width=0.006, pivot="mid", color="black")
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.6)
+    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncol=2, fontsize=8, frameon=False)
 
 
 def _unit(runs: np.ndarray) -> np.ndarray:

@@ -144,12 +144,15 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
     return Target(name, kind, "plan", scene, goal, tuple(paths), drawn, layout.depth, optimal, lower)
 
 
-def glyph_target(strokes: np.ndarray, name: str, cells: int = 32) -> Target:
-    """A glyph's own strokes, pushed one by one; the goal is what they leave on level sand."""
-    blade = Blade()
-    scene = make_scene((cells, cells), 0.01, tool=blade)
-    low, high = task.GLYPH_SQUARE
-    placed = task.place(strokes, (low, cells * 0.01 - (0.32 - high)))
+def glyph_target(strokes: np.ndarray, name: str) -> Target:
+    """A glyph's own strokes, pushed one by one; the goal is what they leave on level sand.
+
+    A glyph of the unit square takes 32 x 32 cells of 0.01 m; a wider text as many more columns as it needs.
+    """
+    blade, spacing = Blade(), 0.01
+    placed = task.place(strokes)
+    beyond = max(0.0, placed[:, [0, 2]].max() - task.GLYPH_SQUARE[1])
+    scene = make_scene((32, 32 + math.ceil(beyond / spacing - 1e-6)), spacing, tool=blade)
     paths = tuple(stroke.reshape(2, 2) for stroke in placed)
     goal, _ = _push_all(scene, np.zeros(scene.grid.shape, np.float32), paths)
     return Target(name, "glyph", "strokes", scene, goal, paths, False, float(blade.depth), True, len(paths))

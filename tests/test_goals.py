@@ -27,9 +27,10 @@ def test_letters():
 
 
 def test_text_in_single_strokes():
-    strokes = goals.text_strokes("L1")
+    assert np.ptp(goals.text_strokes("LONG")[:, [0, 2]]) > 2
+    assert np.ptp(goals.text_strokes("LONG")[:, [1, 3]]) == pytest.approx(1)
+    strokes = goals.text_strokes("L")
     assert np.all((strokes >= -1e-9) & (strokes <= 1 + 1e-9))
-    assert np.ptp(strokes[:, [0, 2]]) == pytest.approx(1)
     # The foot of the L is its longest level stroke, and lies at the bottom.
     level = strokes[np.abs(strokes[:, 1] - strokes[:, 3]) < 1e-9]
     foot = level[np.argmax(np.abs(level[:, 0] - level[:, 2]))]
