@@ -20,6 +20,7 @@ _HOMES = {
     "OutcomeError": "sim",
     "Plan": "planner",
     "Pose": "tool",
+    "Pushed": "push",
     "Relaxation": "settling",
     "Scene": "scene",
     "Settled": "settling",

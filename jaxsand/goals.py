@@ -28,7 +28,8 @@ def letter_map(letter: str) -> tuple[np.ndarray, Cell]:
     table = _map_letters()
     if letter not in table:
         raise ValueError(f"letter: got {letter!r}; give one of {string.ascii_uppercase}")
-    return table[letter]
+    dig, start = table[letter]
+    return dig.copy(), start
 
 
 def read_text_map(text: str, name: str = "map") -> tuple[np.ndarray, Cell | None]:
@@ -64,6 +65,8 @@ def read_image(path: str | Path) -> np.ndarray:
 
     try:
         with Image.open(path) as image:
+            if image.mode.startswith("I"):  # 16 bits: a height map's usual depth
+                return np.flipud(np.asarray(image, float) / 65535 - 1)
             flat = Image.new("RGBA", image.size, "white")
             flat.alpha_composite(image.convert("RGBA"))
     except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, OSError) as error:
@@ -83,7 +86,9 @@ def read_heights(path: str | Path) -> np.ndarray:
         raise ValueError(f"{path}: got shape {shape}; give one height map [H, W] with at least one cell")
     if heights.dtype.kind not in "fiu":
         raise ValueError(f"{path}: got dtype {heights.dtype}; give heights in metres as floats")
-    return heights
+    if heights.dtype.itemsize > 8:
+        raise ValueError(f"{path}: got dtype {heights.dtype}; save float32 or float64")
+    return heights.astype(heights.dtype.newbyteorder("="))
 
 
 def terrain() -> np.ndarray:

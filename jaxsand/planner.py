@@ -93,7 +93,7 @@ def connected_pieces(dig: np.ndarray) -> list[set[Cell]]:
 
 
 def _distances(cells: list[Cell]) -> np.ndarray:
-    """Steps between any two cells of a connected map, by doubling the reach: [n, n]."""
+    """Steps between any two cells of a connected map, breadth first from each: [n, n]."""
     at = {cell: i for i, cell in enumerate(cells)}
     near = [[at[r + dr, c + dc] for dr, dc in _MOVES.values() if (r + dr, c + dc) in at] for r, c in cells]
     steps = np.full((len(cells), len(cells)), -1)

@@ -23,6 +23,7 @@ from jaxsand.displace import Job, pass_on, radial, shares, spread, take
 from jaxsand.grid import centres
 from jaxsand.loop import repeat_until
 from jaxsand.scene import Scene
+from jaxsand.settling import Outcome
 from jaxsand.sweep import (
     Flow,
     Lost,
@@ -32,6 +33,8 @@ from jaxsand.sweep import (
     mark,
     prepare,
     quantum,
+    sound,
+    spoiled,
     stand,
     sweep,
     unmark,
@@ -59,14 +62,13 @@ class SteppedPush:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Pushed:
-    """A map [H, W] (m) after the tool was lifted and before it settles, the tool's last pose, whether the window's edge was
-    reached or something was not finite, and the volume pushed over a draining edge (m^3)."""
+    """A map [H, W] (m) after the tool was lifted and before it settles, the `outcome` (bits of `Outcome`), the volume that
+    `drained` over the map's edge (m^3), and the tool's last `pose`."""
 
     height: jax.Array
-    pose: Pose
-    window_edge: jax.Array
-    not_finite: jax.Array
+    outcome: jax.Array
     drained: jax.Array
+    pose: Pose
 
 
 _State = tuple[jax.Array, Lost, jax.Array]  # height, height lost over the rim, movement at the window's edge
@@ -80,24 +82,27 @@ def push_along(
     Also returns what `record(height)` gave after each leg, stacked. Without a tool the map stays as it is.
     """
     usable = jnp.all(jnp.isfinite(path))
+    for leaf in jax.tree.leaves(scene.tool):
+        usable = usable & jnp.all(jnp.isfinite(leaf))
     path = jnp.where(usable, path, 0)
     if isinstance(scene.tool, NoTool):
         still = Pose(path[-1, 0], path[-1, 1], jnp.ones_like(path[0, 0]), jnp.zeros_like(path[0, 0]))
         legs = path.shape[0] - 1
         frames = jax.tree.map(lambda f: jnp.broadcast_to(f, (legs, *f.shape)), record(height)) if record else ()
-        return Pushed(height, still, jnp.zeros((), bool), ~usable, jnp.zeros_like(path[0, 0])), frames
+        return Pushed(height, _outcome(jnp.zeros((), bool), ~usable), jnp.zeros_like(path[0, 0]), still), frames
     bed = prepare(scene)
-    marked, broken = mark(scene, height)
-    # An unusable path lifts the blade above everything.
+    intact, broken = mark(scene, height)
+    # Of a path or a tool that is not finite nothing is used; the blade hangs above everything.
+    tool = jax.tree.map(lambda leaf: jnp.where(usable, leaf, bed.spacing), scene.tool)
     bottom = jnp.where(usable, -jnp.asarray(scene.tool.depth), jnp.inf)
-    scale = 4 * (largest(marked) + jnp.where(usable, jnp.abs(bottom), 0))
+    scale = 4 * (largest(intact) + jnp.where(usable, jnp.abs(bottom), 0))
     flow = Flow(jnp.asarray(push.rate), quantum(scale))
-    job = Job(bed, *centres(scene.grid, height.dtype), scene.tool, bottom, flow)
+    job = Job(bed, *centres(scene.grid, height.dtype), tool, bottom, flow)
     lost: Lost = jnp.zeros_like(height) if isinstance(scene.edge, Draining) else None
     moved = jnp.zeros_like(bottom)
     if isinstance(scene.window, Window):
-        moved = lax.stop_gradient(worst_excess(bed, halo(marked)))
-    state = (marked, lost, moved)
+        moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
+    state = (intact, lost, moved)
 
     pose, length = _heading(path[0], path[1], None)
     state = _lower(scene, push, job, pose, None, state)
@@ -123,15 +128,21 @@ def push_along(
         edge = moved > scene.window.tolerance
     drained = jnp.zeros_like(bottom) if lost is None else jnp.sum(lost) * bed.spacing**2
     end = Pose(path[-1, 0], path[-1, 1], pose.cos, pose.sin)
-    return Pushed(unmark(marked, height), end, edge, broken | ~usable, drained), frames
+    broken = broken | spoiled(intact, marked) | ~sound(bed) | ~usable
+    return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames
+
+
+def _outcome(window_edge: jax.Array, not_finite: jax.Array) -> jax.Array:
+    return (Outcome.WINDOW_EDGE * window_edge + Outcome.NOT_FINITE * not_finite).astype(jnp.int32)
 
 
 def _heading(start: jax.Array, stop: jax.Array, before: Pose | None) -> tuple[Pose, jax.Array]:
     """The pose at the start of a leg and the leg's length. A leg of no length keeps the heading; the first one faces +x."""
     run = stop - start
-    square = jnp.sum(run**2)
-    moving = square > 0
-    length = jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1)), 0)
+    size = lax.stop_gradient(jnp.max(jnp.abs(run)))  # squares of far strokes would overflow
+    moving = size > 0
+    part = jnp.where(moving, run / jnp.where(moving, size, 1), 1)
+    length = jnp.where(moving, size * jnp.sqrt(jnp.sum(part**2)), 0)
     unit = run / jnp.where(moving, length, 1)
     cos, sin = (before.cos, before.sin) if before else (jnp.ones_like(length), jnp.zeros_like(length))
     return Pose(start[0], start[1], jnp.where(moving, unit[0], cos), jnp.where(moving, unit[1], sin)), length

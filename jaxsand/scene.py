@@ -1,7 +1,7 @@
 """A scene: everything about the sand except its height."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -101,12 +101,6 @@ def cast(tree: Any, dtype: jax.typing.DTypeLike) -> Any:
     return jax.tree.map(one, tree)
 
 
-def with_tool(scene: Scene, tool: NoTool | Blade) -> Scene:
-    """The same scene with another tool, checked."""
-    _check_tool(tool, scene.grid)
-    return replace(scene, tool=tool)
-
-
 def concrete(value: Any) -> np.ndarray | None:
     """The value as a numpy array, or None while it is being traced."""
     if isinstance(value, jax.core.Tracer):
@@ -201,11 +195,12 @@ def _check_tool(tool: Any, grid: Grid) -> None:
         thickness, dx = concrete(tool.thickness), concrete(grid.spacing)
         if thickness is None or dx is None:
             return
-        if np.any(thickness < dx * (1 - 1e-6)):
-            raise ValueError(
-                f"tool.thickness: got {tool.thickness!r} m, thinner than a cell of {grid.spacing!r} m; "
-                "thicken the blade or refine the grid"
-            )
+        for name, extent in (("width", concrete(tool.width)), ("thickness", thickness)):
+            if extent is not None and np.any(extent < dx * (1 - 1e-6)):
+                raise ValueError(
+                    f"tool.{name}: got {getattr(tool, name)!r} m, less than a cell of {grid.spacing!r} m; "
+                    "enlarge the blade or refine the grid"
+                )
         if np.any(thickness > dx * math.hypot(*grid.shape)):
             raise ValueError(
                 f"tool.thickness: got {tool.thickness!r} m, more than the map's diagonal; "

@@ -22,6 +22,8 @@ from jaxsand.sweep import (
     mark,
     prepare,
     quantum,
+    sound,
+    spoiled,
     steepest,
     sweep,
     unmark,
@@ -38,7 +40,8 @@ class Outcome(IntFlag):
     WINDOW_EDGE = 2
     """Sand moved at the edge of the window while the tool was down."""
     NOT_FINITE = 4
-    """The map or the stroke holds a NaN or an infinity; such a cell was treated as solid and given back as it was."""
+    """The map, the stroke or the scene holds a NaN or an infinity, or the heights overflowed. A bad cell of the map was treated
+    as solid and given back as it was."""
 
 
 @jax.tree_util.register_dataclass
@@ -48,7 +51,7 @@ class Relaxation:
 
     With 8 neighbours it is stable for rate < 1/4.83 and a convex combination of neighbouring heights (no overshoot: the
     highest point never rises, the lowest never falls) up to 1/6.83; with 4 neighbours for both up to 1/4, on a map of one
-    row or column up to 1/2. The default is the paper's dx^2/8. The settled map depends slightly on the rate.
+    row or column up to 1/2 (1/4 if its edge drains). The default is the paper's dx^2/8. The settled map depends slightly on the rate.
     """
 
     rate: jax.Array | float = 0.125
@@ -103,7 +106,8 @@ def settle(
 ) -> Settled:
     """Lets a map [H, W] (m) settle to its angle of repose. One map; batch with `jax.vmap` or `settle_batch`.
 
-    Conserves volume up to what `sweep` says of rounding, keeps the map within its lowest and highest point, commutes with
+    Conserves volume up to what sweep.py says of rounding, keeps the map within its lowest and highest point at the rates that
+    `Relaxation` names, commutes with
     adding a constant, with h -> -h, mirrors and quarter turns, and leaves a settled map as it is, to the last bit.
     Computes in the height's dtype. Differentiable in the height and the angle of repose, by what `stop` says of itself.
 
@@ -165,7 +169,7 @@ def check_rule(scene: Scene, scheme: Relaxation | None, stop: Stop | None) -> tu
     else:
         raise ValueError(f"stop: got {stop!r}; give UntilStill() or Sweeps(count)")
     tolerance = concrete(stop.tolerance)
-    if tolerance is not None and not (tolerance >= 0).all():
+    if tolerance is not None and not ((tolerance >= 0) & (tolerance < float("inf"))).all():
         raise ValueError(f"stop.tolerance: got {stop.tolerance!r}; give a slope of 0 or more, such as 1e-3")
     return scheme, stop
 
@@ -173,7 +177,7 @@ def check_rule(scene: Scene, scheme: Relaxation | None, stop: Stop | None) -> tu
 def _stable_rate(scene: Scene) -> float:
     """The rate above which the checkerboard (in one dimension: the saw-tooth) grows."""
     if 1 in scene.grid.shape:
-        return 1 / 2
+        return 1 / 4 if isinstance(scene.edge, Draining) else 1 / 2
     return {4: 1 / 4, 8: 1 / (2 + 2 * 2**0.5)}[scene.grid.neighbours]
 
 
@@ -204,7 +208,7 @@ def relax(scene: Scene, height: jax.Array, scheme: Relaxation, stop: Stop) -> Se
     state, sweeps = _run(bed, flow, stop, (halo(marked), lost))
     residual = worst_excess(bed, state[0])
     settled = unmark(at(state[0]), height)
-    broken = broken | ~jnp.isfinite(residual)
+    broken = broken | spoiled(marked, at(state[0])) | ~sound(bed)
     outcome = Outcome.NOT_STILL * (residual > stop.tolerance) + Outcome.NOT_FINITE * broken
     drained = jnp.zeros_like(residual) if state[1] is None else jnp.sum(state[1]) * bed.spacing**2
     return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), drained)
@@ -217,9 +221,7 @@ def _run(bed: Bed, flow: Flow, stop: Stop, state: tuple[jax.Array, Lost]) -> tup
     floor = 2 * flow.quantum / (flow.rate * bed.spacing)
     limit = jnp.maximum(stop.tolerance, lax.stop_gradient(floor))
     interval = min(stop.interval, stop.bound)
-    state, looks = repeat_until(
-        _still, partial(_some_sweeps, interval), -(-stop.bound // interval), (bed, flow, limit), state
-    )
+    state, looks = repeat_until(_still, partial(_some_sweeps, interval), stop.bound // interval, (bed, flow, limit), state)
     return state, looks * interval
 
 

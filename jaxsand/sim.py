@@ -25,7 +25,7 @@ class Shaped(Settled):
 def act(
     scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike, *, push: SteppedPush | None = None
 ) -> Pushed:
-    """What the tool does to a map [H, W] (m) along `stroke` [4] = x0, y0, x1, y1 (m), up to when it is lifted.
+    """What the tool does to a map [H, W] (m) along `stroke` [4] = x0, y0, x1, y1 (m), up to when it has been lifted.
 
     The map is not settled afterwards; see `step`.
     """
@@ -48,11 +48,15 @@ def step(
     lie off the map touch nothing; a stroke of no length lowers and lifts the tool, facing +x. A stroke that is not finite
     leaves the map as it is and says so in the outcome.
 
+    At a wall or a closed edge the sand ahead has nowhere to go: it stays in its columns, inside the blade, and flows off
+    when the blade is lifted. Everywhere else no sand is inside the tool.
+
     Differentiable once, in forward and reverse mode, in the height, the stroke, the angle of repose and the tool; exactly
     zero where nothing changes (a stroke off the map, a tool above the sand). Continuous in the stroke, except where its
     length goes to zero and its heading is lost.
     """
-    return follow(scene, height, _stroke(stroke, jnp.result_type(height)), push=push, scheme=scheme, stop=stop)
+    height = jnp.asarray(height)
+    return follow(scene, height, _stroke(stroke, height.dtype), push=push, scheme=scheme, stop=stop)
 
 
 def follow(
@@ -138,12 +142,17 @@ _ADVICE = {
         "the sand is not still ({residual:.2g} in slope above repose after {sweeps} sweeps): raise the stop rule's bound or "
         "tolerance, or, where heights are large against the spacing, subtract their mean or use float64"
     ),
-    Outcome.WINDOW_EDGE: "sand moved at the window's edge while the tool was down: enlarge Window(size) or use Whole()",
-    Outcome.NOT_FINITE: "the map or the stroke holds a NaN or an infinity: look for it with numpy.isfinite",
+    Outcome.WINDOW_EDGE: (
+        "sand moved at the window's edge while the tool was down, or the map was not still before: enlarge Window(size) or "
+        "use Whole(), and settle to the window's tolerance first"
+    ),
+    Outcome.NOT_FINITE: (
+        "the map, the stroke or the scene holds a NaN or an infinity, or heights overflowed: look with numpy.isfinite"
+    ),
 }
 
 
-def check(result: Settled) -> None:
+def check(result: Settled | Pushed) -> None:
     """Raises `OutcomeError`, with advice, if the outcome of a result (or of any in a batch) is not clean. Host side."""
     outcome = concrete(result.outcome)
     if outcome is None:
@@ -153,10 +162,10 @@ def check(result: Settled) -> None:
         return
     first = bad[0]
     code = Outcome(int(outcome.ravel()[first]))
-    detail = {
-        "residual": float(np.ravel(result.residual)[first]),
-        "sweeps": int(np.broadcast_to(result.sweeps, outcome.shape).ravel()[first]),
-    }
+    detail = {}
+    if isinstance(result, Settled):
+        detail["residual"] = float(np.ravel(result.residual)[first])
+        detail["sweeps"] = int(np.broadcast_to(result.sweeps, outcome.shape).ravel()[first])
     where = f"{bad.size} of {outcome.size} maps, first {int(first)}: " if outcome.ndim else ""
     raise OutcomeError(where + "; ".join(_ADVICE[bit].format(**detail) for bit in code))
 
@@ -172,7 +181,10 @@ def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tupl
         raise ValueError(f"push.substep: got {push.substep!r}; give a part of a spacing, above 0 and at most 1")
     if isinstance(push.sweeps, bool) or not isinstance(push.sweeps, int) or push.sweeps < 0:
         raise ValueError(f"push.sweeps: got {push.sweeps!r}; give a whole number of at least 0")
-    check_rule(scene, Relaxation(push.rate), None)
+    try:
+        check_rule(scene, Relaxation(push.rate), None)
+    except ValueError as error:
+        raise ValueError(str(error).replace("scheme.rate", "push.rate")) from None
     scheme, stop = check_rule(scene, scheme, stop)
     scene, height = fit(scene, height)
     return scene, height, cast((push, scheme, stop), height.dtype)
@@ -203,7 +215,7 @@ def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, rec
     push, scheme, stop = rules
     pushed, frames = push_along(scene, height, path, push, record)
     settled = relax(scene, pushed.height, scheme, stop)
-    outcome = settled.outcome | Outcome.WINDOW_EDGE * pushed.window_edge | Outcome.NOT_FINITE * pushed.not_finite
+    outcome = settled.outcome | pushed.outcome
     settled = replace(settled, outcome=outcome, drained=settled.drained + pushed.drained)
     return Shaped(**vars(settled), pose=pushed.pose), frames
 

@@ -106,6 +106,16 @@ def mark(scene: Scene, height: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(finite, height, jnp.nan), ~jnp.all(finite)
 
 
+def spoiled(before: jax.Array, after: jax.Array) -> jax.Array:
+    """Whether a marked map lost a cell on the way, or overflowed."""
+    return jnp.any((jnp.isnan(after) != jnp.isnan(before)) | jnp.isinf(after))
+
+
+def sound(bed: Bed) -> jax.Array:
+    """Whether spacing and angles are usable numbers; what is traced escapes `make_scene`."""
+    return jnp.all(jnp.isfinite(bed.drop) & (bed.drop >= 0)) & (bed.spacing > 0)
+
+
 def unmark(height: jax.Array, original: jax.Array) -> jax.Array:
     """The height with the original values in the cells that hold no sand."""
     return jnp.where(jnp.isnan(height), original, height)

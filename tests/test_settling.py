@@ -183,7 +183,7 @@ def test_outcome_names_a_bound_that_is_too_small():
     h = np.zeros((16, 16))
     h[8, 8] = 1
     scene = js.make_scene(h.shape, DX, ANGLE)
-    short = js.settle(scene, h, stop=js.UntilStill(bound=16))
+    short = js.settle(scene, h, stop=js.UntilStill(bound=20))
     assert int(short.sweeps) == 16
     assert int(short.outcome) == js.Outcome.NOT_STILL
     assert float(short.residual) > 1e-3
@@ -248,6 +248,24 @@ def test_cliffs_and_spikes_of_a_million_cells(dtype, height):
     assert np.all(np.isfinite(s.height))
     assert volume_error(h, s.height) < 1e-6
     assert int(s.outcome) in (0, js.Outcome.NOT_STILL)
+
+
+def test_nothing_falls_below_a_draining_rim():
+    h = np.zeros((1, 32))
+    h[0, 12:20] = 0.1
+    scene = js.make_scene(h.shape, DX, ANGLE, edge=js.Draining(0.0))
+    assert float(js.settle(scene, h, scheme=js.Relaxation(0.25)).height.min()) >= 0
+    with pytest.raises(ValueError, match="unstable above 0.25"):
+        js.settle(scene, h, scheme=js.Relaxation(0.3))
+
+
+def test_traced_nonsense_and_overflow_are_flagged():
+    h = np.zeros((6, 6), "float32")
+    for angle in (np.nan, 2.0):
+        out = jax.jit(lambda a: js.settle(js.make_scene((6, 6), DX, a), h))(angle)
+        assert int(out.outcome) & js.Outcome.NOT_FINITE
+    h[2, 2], h[2, 3] = 3e38, -3e38
+    assert int(js.settle(js.make_scene((6, 6), DX), h).outcome) & js.Outcome.NOT_FINITE
 
 
 def test_a_large_offset_ends_in_bounded_time_and_says_so():

@@ -30,7 +30,7 @@ def test_equal_or_flagged():
         window = js.Window(size, tolerance=0.0)
         out = jax.vmap(lambda s, w=window: js.act(sand(w), jnp.zeros(SHAPE), s))(strokes)
         same = [bool(np.abs(a - b).max() < ROUNDING) for a, b in zip(out.height, whole, strict=True)]
-        flagged = [bool(f) for f in out.window_edge]
+        flagged = [bool(o & js.Outcome.WINDOW_EDGE) for o in out.outcome]
         assert all(s or f for s, f in zip(same, flagged, strict=True))
         exact[size] = (sum(same), sum(flagged))
     assert exact[12, 12][1] >= 11  # too small: said
@@ -50,7 +50,10 @@ def test_the_default_tolerance_keeps_the_difference_small():
 
 def test_an_unsettled_map_is_flagged():
     rough = np.random.default_rng(2).uniform(-0.05, 0.05, SHAPE)
-    assert bool(js.act(sand(js.Window((56, 56))), rough, (0.3, 0.3, 0.5, 0.4)).window_edge)
+    out = js.act(sand(js.Window((56, 56))), rough, (0.3, 0.3, 0.5, 0.4))
+    assert int(out.outcome) == js.Outcome.WINDOW_EDGE
+    with pytest.raises(js.OutcomeError, match="enlarge Window"):
+        js.check(out)
 
 
 def test_a_window_at_the_map_edge_with_everything_in_it():
@@ -67,7 +70,7 @@ def test_a_window_at_the_map_edge_with_everything_in_it():
         return js.act(scene, np.zeros(SHAPE), stroke)
 
     whole, window = run(None), run(js.Window((60, 60), tolerance=0.0))
-    assert not bool(window.window_edge)
+    assert int(window.outcome) == 0
     assert np.abs(whole.height - window.height).max() < ROUNDING
     assert float(whole.drained) == pytest.approx(float(window.drained), rel=1e-9, abs=1e-15)
 
