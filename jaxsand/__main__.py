@@ -14,9 +14,10 @@ from jaxsand.commands import run_benchmark, run_plan, run_settle, run_shape
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns its exit code."""
+    """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
-    _keep_compiled_programs()
+    if options.run is not run_benchmark:  # which tells compile time apart
+        _keep_compiled_programs()
     try:
         options.run(options)
     except ValueError as error:
@@ -45,9 +46,9 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--surface", default="level", help="what lies there before: level, terrain or a .npy file (m)")
     p.add_argument("--relief-mm", type=_number, default=10.0, help="height range of --surface terrain")
     p.add_argument("--depth-mm", type=_number, help="trench depth (3; 7.5 for .npy and terrain)")
-    p.add_argument("--spacing", type=_number, default=0.01, help="grid spacing in m (0.01)")
-    p.add_argument("--resolution", type=_count, default=6, help="grid cells to a map cell (6)")
-    p.add_argument("--cells", type=_count, default=48, help="grid cells along the longer side of a .png or terrain (48)")
+    p.add_argument("--spacing", type=_number, help="grid spacing in m (0.01)")
+    p.add_argument("--resolution", type=_count, help="grid cells to a map cell (6)")
+    p.add_argument("--cells", type=_count, help="grid cells along the longer side of a .png or terrain (48)")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (shape-GOAL)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_shape)
@@ -114,6 +115,12 @@ def _fail(message: str) -> int:
 def _keep_compiled_programs() -> None:
     """Lets JAX keep compiled programs in the user's cache, so that a second run starts fast."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsand"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if not os.access(cache, os.W_OK):
+        return
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")

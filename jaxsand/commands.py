@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 def run_shape(options: argparse.Namespace) -> None:
     tell = progress()
-    out = folder(options.out or Path(f"shape-{_plain(options.goal)}"))
     tell("reading the goal")
     from jaxsand.render import save_animation, save_figure, shape_figure
     from jaxsand.shaping import shape
@@ -27,7 +26,9 @@ def run_shape(options: argparse.Namespace) -> None:
     began = time.perf_counter()
     target = _target(options)
     planned = time.perf_counter() - began
-    result = shape(target, _surface(options, target), tell)
+    surface = _surface(options, target)
+    out = folder(options.out or Path(f"shape-{_plain(options.goal)}"))
+    result = shape(target, surface, tell)
     tell("drawing")
     began = time.perf_counter()
     files = {name: out / name for name in ("result.json", "shape.png", "shape.gif")}
@@ -51,8 +52,7 @@ def _report(result: "ShapeResult", planned: float, drawn: float, files: dict[str
         "strokes": [[round(v, 6) for v in stroke] for stroke in result.strokes],
         "lifted": result.lifted,
         "steps": result.steps,
-        "optimal": target.optimal,
-        "lower_bound": target.lower_bound,
+        **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
         **result.figures,
         "seconds": planned + drawn + sum(seconds.values()),
         "seconds_plan": planned + seconds["prepare"],
@@ -66,8 +66,10 @@ def _report(result: "ShapeResult", planned: float, drawn: float, files: dict[str
 
 
 def _summary(report: dict[str, Any]) -> str:
-    proof = "proven shortest" if report["optimal"] else f"lower bound {report['lower_bound']}"
-    how = f"{report['steps']} steps ({proof})" if report["method"] == "plan" else f"{report['steps']} strokes"
+    how = f"{report['steps']} strokes"
+    if report["method"] == "plan":
+        proof = "proven shortest" if report["optimal"] else f"at least {report['lower_bound']} are needed"
+        how = f"{report['steps']} steps ({proof})"
     return "\n".join(
         (
             f"{report['goal']} ({report['goal_kind']}): {how}",
@@ -93,6 +95,9 @@ def _target(options: argparse.Namespace) -> "Target":
     if method == "strokes":
         if is_file or name == "terrain":
             raise ValueError(f"method: 'strokes' pushes a glyph's own strokes, {name} has none; use --method plan")
+        for option in ("start", "depth_mm", "spacing", "resolution", "cells"):
+            if getattr(options, option) is not None:
+                raise ValueError(f"{option.replace('_', '-')}: has no effect with --method strokes; leave it out")
         letter = name.upper() if len(name) == 1 and name.isascii() and name.isalpha() else ""
         return shaping.glyph_target(goals.letter_strokes(letter) if letter else goals.text_strokes(name), name)
     start = _cell(options.start)
@@ -105,12 +110,12 @@ def _target(options: argparse.Namespace) -> "Target":
     if options.start:
         raise ValueError(f"start: {name} is no map of # and .; leave --start out")
     if suffix == ".png":
-        return shaping.image_target(goals.read_image(existing(path)), path.stem, _layout(options), options.cells)
+        return shaping.image_target(goals.read_image(existing(path)), path.stem, _layout(options), _cells(options))
     if suffix == ".npy":
         return shaping.height_target(goals.read_heights(existing(path)), "heights", path.stem, _layout(options, 7.5))
     if name == "terrain":
         layout = _layout(options, 7.5)
-        land = shaping.terrain_surface((options.cells, options.cells), 4 * layout.depth)
+        land = shaping.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
         return shaping.height_target(land, "terrain", name, layout)
     raise ValueError(
         f"goal: got {name!r}; give a letter A to Z, a .txt, .png or .npy file, or terrain, "
@@ -122,14 +127,21 @@ def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
     from jaxsand.shaping import Layout
 
     depth = depth_mm if options.depth_mm is None else options.depth_mm
-    for field, value in (("spacing", options.spacing), ("depth-mm", depth)):
+    spacing = 0.01 if options.spacing is None else options.spacing
+    resolution = options.resolution or 6
+    for field, value in (("spacing", spacing), ("depth-mm", depth)):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{field}: got {value}; give a positive number")
-    for field, value, most in (("resolution", options.resolution, 64), ("cells", options.cells, 1024)):
+    for field, value, most in (("resolution", resolution, 64), ("cells", _cells(options), 1024)):
         if not 1 <= value <= most:
             raise ValueError(f"{field}: got {value}; give a number of grid cells from 1 to {most}")
-    margin = math.ceil(5 * options.resolution / 3)
-    return Layout(cell=options.resolution, spacing=options.spacing, depth=depth / 1e3, margin=margin)
+    margin = math.ceil(5 * resolution / 3)
+    return Layout(cell=resolution, spacing=spacing, depth=depth / 1e3, margin=margin)
+
+
+def _cells(options: argparse.Namespace) -> int:
+    cells: int = options.cells or 48
+    return cells
 
 
 def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | None":
@@ -155,7 +167,6 @@ def run_settle(options: argparse.Namespace) -> None:
     tell = progress()
     if options.out_file.suffix != ".npy":
         raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")
-    folder(options.out_file.parent)
     from jaxsand import goals
 
     heights = goals.read_heights(existing(options.input))
@@ -168,12 +179,14 @@ def run_settle(options: argparse.Namespace) -> None:
         heights = heights.astype(np.float32)
     from jaxsand.scene import make_scene
     from jaxsand.settling import Outcome, Relaxation, UntilStill, settle
+    from jaxsand.sim import OutcomeError, check
     from jaxsand.task import volume_error
 
     if not np.all(np.isfinite(heights)):
         raise ValueError(f"{options.input}: got {np.sum(~np.isfinite(heights))} cells that are not finite; fill them first")
     scene = make_scene(heights.shape, options.spacing, math.radians(options.repose_deg), options.neighbours)
     stop = UntilStill(options.tol, bound=options.bound)
+    folder(options.out_file.parent)
     tell("settling")
     began = time.perf_counter()
     compiled = jax.jit(lambda h: settle(scene, h, scheme=Relaxation(), stop=stop)).lower(heights).compile()
@@ -195,7 +208,10 @@ def run_settle(options: argparse.Namespace) -> None:
         "files": [str(options.out_file)],
     }
     if outcome:
-        print("warning: the map is not still yet; raise --bound or --tol", file=sys.stderr)
+        try:
+            check(settled)
+        except OutcomeError as error:
+            print(f"warning: {error}", file=sys.stderr)
     _print(options, report, _lines)
 
 
@@ -206,7 +222,7 @@ def run_plan(options: argparse.Namespace) -> None:
     start = _cell(options.start)
     own: tuple[int, int] | None
     if len(options.map) == 1:
-        dig, own = goals.letter_map(options.map.upper())
+        dig, own = goals.letter_map(options.map.upper() if options.map.isascii() else options.map)
     else:
         dig, own = goals.read_text_map(read_text(Path(options.map)), options.map)
     began = time.perf_counter()

@@ -2,9 +2,9 @@
 
 Whenever the share of a cell that the tool covers grows from a to b, the share (b - a) / (1 - a) of its sand above the
 tool's bottom has to leave. It goes to neighbouring cells, to the one or two of the eight that lie in its direction, shared
-as the direction divides the angle between them; it comes to rest in their open share and moves on in the rest. Sand that has
-nowhere to go, at a wall or a closed edge, stays in its column; over a draining edge it is lost. Every amount is a whole
-number of quanta (see sweep.py), so that volume is kept as well as floats allow.
+as the direction divides the angle between them; it comes to rest in their open share and moves on in the rest. Sand that
+has nowhere to go, at a wall or a closed edge, stays in its column until the tool leaves it; over a draining edge it is
+lost. Every amount is a whole number of quanta (see sweep.py), so that volume is kept as well as floats allow.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand.loop import repeat_until
-from jaxsand.sweep import SHUT, Bed, Flow, Lost, at, halo, truncate
+from jaxsand.sweep import Bed, Flow, Lost, at, halo, lose, truncate
 from jaxsand.tool import Blade, Pose, local
 
 _EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
@@ -36,9 +36,8 @@ class Job:
 
 def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Takes up the sand that has to leave as the cover grows: the height left and the height taken."""
-    open_before = 1 - before
-    shut = open_before < SHUT
-    share = jnp.where(shut, 1, jnp.clip((cover - before) / jnp.where(shut, 1, open_before), 0, 1))
+    grown = cover > before
+    share = jnp.where(grown, (cover - before) / jnp.where(grown, 1 - before, 1), 0)
     taken = _whole(job, share * jnp.where(h > job.bottom, h - job.bottom, 0))
     return h - taken, taken
 
@@ -58,7 +57,7 @@ def pass_on(
         s_there = at(halo(s, 0.0), -di, -dj) if s.ndim else s
         received = received + _whole(job, s_there * at(source, -di, -dj)) * at(room)
         if job.bed.rim is not None and lost is not None:
-            lost = lost + given * at(job.bed.rim.beyond, di, dj)
+            lost = lose(job.flow, lost, given * at(job.bed.rim.beyond, di, dj))
     rest = _whole(job, free * received)
     return h + (rest + kept), lost, received - rest
 

@@ -15,7 +15,7 @@ def existing(path: Path) -> Path:
 
 def read_text(path: Path) -> str:
     try:
-        return existing(path).read_text(encoding="utf-8")
+        return existing(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: cannot be read as text ({type(error).__name__}); give rows of # and .") from None
 

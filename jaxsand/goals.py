@@ -79,7 +79,7 @@ def read_heights(path: str | Path) -> np.ndarray:
     """A height map [H, W] (m) from a .npy file."""
     try:
         heights = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, MemoryError) as error:
         raise ValueError(f"{path}: cannot be read as a .npy array ({_reason(error)}); save one with numpy.save") from None
     if not isinstance(heights, np.ndarray) or heights.ndim != 2 or not heights.size:
         shape = list(getattr(heights, "shape", []))

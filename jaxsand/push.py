@@ -31,6 +31,7 @@ from jaxsand.sweep import (
     halo,
     largest,
     mark,
+    nothing_lost,
     prepare,
     quantum,
     sound,
@@ -38,10 +39,10 @@ from jaxsand.sweep import (
     stand,
     sweep,
     unmark,
+    volume_lost,
     worst_excess,
 )
 from jaxsand.tool import NoTool, Pose, coverage, local
-from jaxsand.walls import Draining
 from jaxsand.window import Window, cut, edge_movement, origin, paste
 
 
@@ -81,7 +82,9 @@ def push_along(
 
     Also returns what `record(height)` gave after each leg, stacked. Without a tool the map stays as it is.
     """
-    usable = jnp.all(jnp.isfinite(path))
+    # Beyond this the floats cannot tell on which side of the map a point lies.
+    farthest = scene.grid.spacing * 2.0 ** (jnp.finfo(path.dtype).nmant + 8)
+    usable = jnp.all(jnp.abs(path) < farthest)
     for leaf in jax.tree.leaves(scene.tool):
         usable = usable & jnp.all(jnp.isfinite(leaf))
     path = jnp.where(usable, path, 0)
@@ -98,7 +101,7 @@ def push_along(
     scale = 4 * (largest(intact) + jnp.where(usable, jnp.abs(bottom), 0))
     flow = Flow(jnp.asarray(push.rate), quantum(scale))
     job = Job(bed, *centres(scene.grid, height.dtype), tool, bottom, flow)
-    lost: Lost = jnp.zeros_like(height) if isinstance(scene.edge, Draining) else None
+    lost = nothing_lost(scene, height)
     moved = jnp.zeros_like(bottom)
     if isinstance(scene.window, Window):
         moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
@@ -126,7 +129,7 @@ def push_along(
     edge = jnp.zeros((), bool)
     if isinstance(scene.window, Window):
         edge = moved > scene.window.tolerance
-    drained = jnp.zeros_like(bottom) if lost is None else jnp.sum(lost) * bed.spacing**2
+    drained = volume_lost(bed, lost)
     end = Pose(path[-1, 0], path[-1, 1], pose.cos, pose.sin)
     broken = broken | spoiled(intact, marked) | ~sound(bed) | ~usable
     return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames
@@ -184,7 +187,8 @@ def _advance(push: SteppedPush, params: Any, k: jax.Array, state: _State) -> _St
     end = Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin)
 
     def move(job: Job, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost, jax.Array]:
-        before = coverage(job.tool, pose, job.x, job.y, job.bed.spacing)
+        # A hair less than what was covered, lest a rounded pose leave a hair of sand in the blade.
+        before = coverage(job.tool, pose, job.x, job.y, job.bed.spacing, -1e-3 * job.bed.spacing)
         swept = coverage(job.tool, pose, job.x, job.y, job.bed.spacing, ahead)
         contact = _contact(job, swept, h)
         h, carried = take(job, h, before, swept)

@@ -36,8 +36,8 @@ def shape_figure(result: ShapeResult) -> "Figure":
     axes[1, 1].set_title("the sand, lit from the north-west", loc="left")
     axes[1, 1].set(xlabel="x (m)", ylabel="y (m)")
     figure.suptitle(
-        f"{target.name}: {result.steps} {'steps' if target.method == 'plan' else 'strokes'}, IoU {f['iou']:.3f}, l2 reduction {f['l2_reduction']:.3f}, "
-        f"steepest slope {f['max_slope_deg']:.1f}°"
+        f"{target.name}: {result.steps} {'steps' if target.method == 'plan' else 'strokes'}, "
+        f"IoU {f['iou']:.3f}, l2 reduction {f['l2_reduction']:.3f}, steepest slope {f['max_slope_deg']:.1f}°"
     )
     return figure
 

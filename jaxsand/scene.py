@@ -54,12 +54,12 @@ def make_scene(
     shape = _shape(shape)
     _positive("spacing", spacing, "give the distance of cell centres in metres, such as 0.01")
     _angle(repose_angle, shape)
-    if neighbours not in (4, 8):
+    if not isinstance(neighbours, int | np.integer) or neighbours not in (4, 8):
         raise ValueError(f"neighbours: got {neighbours!r}; choose 4 or 8")
     scene = Scene(
-        Grid(_number(spacing), shape, neighbours),
+        Grid(_number(spacing), shape, 4 if neighbours == 4 else 8),
         Material(_number(repose_angle)),
-        Open() if walls is None else walls,
+        Open() if walls is None else _as_walls(walls),
         Closed() if edge is None else edge,
         Whole() if window is None else window,
         NoTool() if tool is None else tool,
@@ -71,8 +71,9 @@ def make_scene(
     return scene
 
 
-def volume(scene: Scene, height: jax.Array) -> jax.Array:
+def volume(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     """Volume of the sand above height 0 (m^3): dx^2 times the sum over the cells that are not solid. Differentiable."""
+    scene, height = fit(scene, height)
     if isinstance(scene.walls, Walls):
         height = jnp.where(scene.walls.solid, 0, height)
     return jnp.sum(height) * jnp.asarray(scene.grid.spacing, height.dtype) ** 2
@@ -80,14 +81,26 @@ def volume(scene: Scene, height: jax.Array) -> jax.Array:
 
 def fit(scene: Scene, height: jax.typing.ArrayLike) -> tuple[Scene, jax.Array]:
     """The height as a float array of the scene's shape, and the scene with every float cast to the height's dtype."""
-    height = jnp.asarray(height)
+    height = as_array("height", height)
     if not jnp.issubdtype(height.dtype, jnp.floating):
         raise ValueError(f"height: got dtype {height.dtype}; convert it to float32 or float64 metres")
     if height.shape != scene.grid.shape:
         rows, columns = scene.grid.shape
         remedy = "use jax.vmap" if height.shape[-2:] == scene.grid.shape else f"give a map of shape [{rows}, {columns}]"
         raise ValueError(f"height: got shape {list(height.shape)}, the scene has [{rows}, {columns}]; {remedy}")
+    angle = concrete(scene.material.repose_angle)
+    if angle is not None and not np.all(np.tan(angle.astype(height.dtype)) > 0):
+        raise ValueError(f"repose_angle: got an angle of pi/2 in {height.dtype}; give a smaller one, or float64 heights")
     return cast(scene, height.dtype), height
+
+
+def as_array(name: str, value: Any, dtype: Any = None) -> jax.Array:
+    """The value as an array, or a ValueError that names it."""
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError) as error:
+        reason = str(error).split("\n", maxsplit=1)[0][:80]
+        raise ValueError(f"{name}: got {type(value).__name__}, no array of numbers ({reason}); give numbers") from None
 
 
 def cast(tree: Any, dtype: jax.typing.DTypeLike) -> Any:
@@ -120,7 +133,7 @@ def _shape(shape: Any) -> tuple[int, int]:
     try:
         rows, columns = shape
         good = all(int(n) == n and not isinstance(n, bool) and n >= 1 for n in (rows, columns))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         good = False
     if not good:
         raise ValueError(f"shape: got {shape!r}; give two whole numbers of at least 1, (rows, columns)")
@@ -129,14 +142,18 @@ def _shape(shape: Any) -> tuple[int, int]:
 
 def _positive(name: str, value: Any, remedy: str) -> None:
     array = concrete(value)
-    if array is not None and not (array.size and np.all(np.isfinite(array)) and np.all(array > 0)):
-        raise ValueError(f"{name}: got {value!r}; it must be finite and above 0: {remedy}")
+    if array is not None and not (array.ndim == 0 and np.isfinite(array) and array > 0):
+        raise ValueError(f"{name}: got {_short(value)}; it must be one finite number above 0: {remedy}")
 
 
 def _finite(name: str, value: Any, remedy: str) -> None:
     array = concrete(value)
-    if array is not None and not (array.size and np.all(np.isfinite(array))):
-        raise ValueError(f"{name}: got {value!r}; it must be finite: {remedy}")
+    if array is not None and not (array.ndim == 0 and np.isfinite(array)):
+        raise ValueError(f"{name}: got {_short(value)}; it must be one finite number: {remedy}")
+
+
+def _short(value: Any) -> str:
+    return repr(value) if np.ndim(value) == 0 else f"an array of shape {list(np.shape(value))}"
 
 
 def _angle(angle: Any, shape: tuple[int, int]) -> None:
@@ -150,6 +167,10 @@ def _angle(angle: Any, shape: tuple[int, int]) -> None:
         )
     if array.ndim not in (0, 2) or (array.ndim == 2 and array.shape != shape):
         raise ValueError(f"repose_angle: got shape {list(array.shape)}; give one number or a map of shape {list(shape)}")
+
+
+def _as_walls(walls: Any) -> Any:
+    return Walls(jnp.asarray(walls.solid)) if isinstance(walls, Walls) and not hasattr(walls.solid, "dtype") else walls
 
 
 def _check_walls(walls: Any, shape: tuple[int, int]) -> None:
@@ -173,7 +194,9 @@ def _check_edge(edge: Any) -> None:
 def _check_window(window: Any, shape: tuple[int, int]) -> None:
     if isinstance(window, Window):
         try:
-            inside = len(window.size) == 2 and all(1 <= int(n) <= m for n, m in zip(window.size, shape, strict=True))
+            inside = len(window.size) == 2 and all(
+                isinstance(n, int | np.integer) and 1 <= n <= m for n, m in zip(window.size, shape, strict=True)
+            )
         except (TypeError, ValueError):
             inside = False
         if not inside:
@@ -201,7 +224,7 @@ def _check_tool(tool: Any, grid: Grid) -> None:
                     f"tool.{name}: got {getattr(tool, name)!r} m, less than a cell of {grid.spacing!r} m; "
                     "enlarge the blade or refine the grid"
                 )
-        if np.any(thickness > dx * math.hypot(*grid.shape)):
+        if np.any(thickness > dx * max(2, math.hypot(*grid.shape))):
             raise ValueError(
                 f"tool.thickness: got {tool.thickness!r} m, more than the map's diagonal; "
                 "give lengths in metres, or enlarge the map"

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxsand.loop import repeat_until
@@ -20,6 +21,7 @@ from jaxsand.sweep import (
     halo,
     largest,
     mark,
+    nothing_lost,
     prepare,
     quantum,
     sound,
@@ -27,6 +29,7 @@ from jaxsand.sweep import (
     steepest,
     sweep,
     unmark,
+    volume_lost,
     worst_excess,
 )
 from jaxsand.walls import Draining
@@ -40,8 +43,8 @@ class Outcome(IntFlag):
     WINDOW_EDGE = 2
     """Sand moved at the edge of the window while the tool was down."""
     NOT_FINITE = 4
-    """The map, the stroke or the scene holds a NaN or an infinity, or the heights overflowed. A bad cell of the map was treated
-    as solid and given back as it was."""
+    """The map, the stroke or the scene holds a NaN or an infinity, the heights overflowed, or the stroke lies farther away
+    than the floats resolve. A bad cell of the map was treated as solid and given back as it was."""
 
 
 @jax.tree_util.register_dataclass
@@ -51,7 +54,8 @@ class Relaxation:
 
     With 8 neighbours it is stable for rate < 1/4.83 and a convex combination of neighbouring heights (no overshoot: the
     highest point never rises, the lowest never falls) up to 1/6.83; with 4 neighbours for both up to 1/4, on a map of one
-    row or column up to 1/2 (1/4 if its edge drains). The default is the paper's dx^2/8. The settled map depends slightly on the rate.
+    row or column up to 1/2 (1/4 if its edge drains). The default is the paper's dx^2/8. The settled map
+    depends slightly on the rate.
     """
 
     rate: jax.Array | float = 0.125
@@ -106,9 +110,9 @@ def settle(
 ) -> Settled:
     """Lets a map [H, W] (m) settle to its angle of repose. One map; batch with `jax.vmap` or `settle_batch`.
 
-    Conserves volume up to what sweep.py says of rounding, keeps the map within its lowest and highest point at the rates that
-    `Relaxation` names, commutes with
-    adding a constant, with h -> -h, mirrors and quarter turns, and leaves a settled map as it is, to the last bit.
+    Conserves volume up to what sweep.py says of rounding, keeps the map within its lowest and highest point at the rates
+    that `Relaxation` names, commutes with adding a constant, with h -> -h, mirrors and quarter turns, and leaves a settled
+    map as it is, to the last bit.
     Computes in the height's dtype. Differentiable in the height and the angle of repose, by what `stop` says of itself.
 
     Raises:
@@ -195,7 +199,7 @@ def check_chunk(chunk: int) -> None:
 
 
 def _whole(name: str, value: Any, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: got {value!r}; give a whole number of at least {least}")
 
 
@@ -204,14 +208,12 @@ def relax(scene: Scene, height: jax.Array, scheme: Relaxation, stop: Stop) -> Se
     bed = prepare(scene)
     marked, broken = mark(scene, height)
     flow = Flow(jnp.asarray(scheme.rate), quantum(largest(marked)))
-    lost: Lost = jnp.zeros_like(height) if isinstance(scene.edge, Draining) else None
-    state, sweeps = _run(bed, flow, stop, (halo(marked), lost))
+    state, sweeps = _run(bed, flow, stop, (halo(marked), nothing_lost(scene, height)))
     residual = worst_excess(bed, state[0])
     settled = unmark(at(state[0]), height)
     broken = broken | spoiled(marked, at(state[0])) | ~sound(bed)
     outcome = Outcome.NOT_STILL * (residual > stop.tolerance) + Outcome.NOT_FINITE * broken
-    drained = jnp.zeros_like(residual) if state[1] is None else jnp.sum(state[1]) * bed.spacing**2
-    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), drained)
+    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), volume_lost(bed, state[1]))
 
 
 def _run(bed: Bed, flow: Flow, stop: Stop, state: tuple[jax.Array, Lost]) -> tuple[Any, jax.Array]:

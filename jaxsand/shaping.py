@@ -60,8 +60,8 @@ class Target:
     paths: tuple[np.ndarray, ...]
     drawn: bool
     depth: float
-    optimal: bool = True
-    lower_bound: int = 0
+    optimal: bool | None = None  # whether the steps are proven fewest, and what is proven of them; plans only
+    lower_bound: int | None = None
 
     @property
     def footprint(self) -> tuple[float, float]:
@@ -79,7 +79,6 @@ class ShapeResult:
     after: np.ndarray
     frames: np.ndarray
     tools: np.ndarray  # x, y, cos, sin of the tool in each frame; NaN while it is lifted
-    outcome: int
     figures: dict[str, float]
     seconds: dict[str, float]
 
@@ -116,6 +115,8 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
     The map is planned on blocks of `layout.cell` grid cells, of which those are dug whose mean lies deep enough.
     """
     goal = np.asarray(goal, float)
+    if not np.all(np.isfinite(goal)):
+        raise ValueError(f"goal: got {int(np.sum(~np.isfinite(goal)))} cells that are not finite; fill them first")
     rows, columns = (n // layout.cell for n in goal.shape)
     if not rows or not columns:
         raise ValueError(
@@ -131,7 +132,6 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
             "so there is nothing to dig; lower the goal, or dig less deep"
         )
     scene = make_scene(goal.shape, layout.spacing, tool=layout.blade)
-    task.fits(scene, goal)
     paths, optimal, lower = [], True, 0
     for piece in connected_pieces(dig):
         part = np.zeros_like(dig)
@@ -154,8 +154,12 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
     beyond = max(0.0, placed[:, [0, 2]].max() - task.GLYPH_SQUARE[1])
     scene = make_scene((32, 32 + math.ceil(beyond / spacing - 1e-6)), spacing, tool=blade)
     paths = tuple(stroke.reshape(2, 2) for stroke in placed)
-    goal, _ = _push_all(scene, np.zeros(scene.grid.shape, np.float32), paths)
-    return Target(name, "glyph", "strokes", scene, goal, paths, False, float(blade.depth), True, len(paths))
+    goal, program = np.zeros(scene.grid.shape, np.float32), _program(scene, 2)
+    for path in paths:
+        shaped, _ = program(jnp.asarray(goal), jnp.asarray(path, np.float32))
+        check(shaped)
+        goal = np.asarray(shaped.height)
+    return Target(name, "glyph", "strokes", scene, goal, paths, False, float(blade.depth))
 
 
 def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> Target:
@@ -195,19 +199,25 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
         longest = -(-longest // 32) * 32
     program = _program(scene, longest)
     compiled = time.perf_counter()
-    height, frames, tools, outcome = start, [start], [_nowhere()], 0
+    height, frames, tools = start, [start], [_nowhere()]
+    runs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    runs_after: list[np.ndarray] = []
     for number, path in enumerate(target.paths, 1):
         tell(f"pushing path {number} of {len(target.paths)}")
         shaped, on_the_way = program(jnp.asarray(height), jnp.asarray(_padded(path, longest), np.float32))
         check(shaped)
-        ways, poses = _moments(scene, height, path, np.asarray(on_the_way))
-        height, outcome = np.asarray(shaped.height), outcome | int(shaped.outcome)
-        frames += [*ways, height]
-        tools += [*poses, _nowhere()]
+        runs.append((height, path, np.asarray(on_the_way)))
+        height = np.asarray(shaped.height)
+        runs_after.append(height)
     ran = time.perf_counter()
+    tell("gathering frames")
+    for (earlier, path, legs), later in zip(runs, runs_after, strict=True):
+        ways, poses = _moments(scene, earlier, path, legs)
+        frames += [*ways, later]
+        tools += [*poses, _nowhere()]
     seconds = {"prepare": prepared - began, "compile": compiled - prepared, "run": ran - compiled}
     figures = _figures(target, start, height)
-    return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), outcome, figures, seconds)
+    return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), figures, seconds)
 
 
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:
@@ -257,12 +267,3 @@ def _headings(runs: np.ndarray) -> np.ndarray:
 
 def _nowhere() -> np.ndarray:
     return np.full(4, np.nan)
-
-
-def _push_all(scene: Scene, height: np.ndarray, paths: tuple[np.ndarray, ...]) -> tuple[np.ndarray, int]:
-    program = _program(scene, 2)
-    outcome = 0
-    for path in paths:
-        shaped, _ = program(jnp.asarray(height), jnp.asarray(path, np.float32))
-        height, outcome = np.asarray(shaped.height), outcome | int(shaped.outcome)
-    return height, outcome

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.push import Pushed, SteppedPush, push_along
-from jaxsand.scene import Scene, cast, concrete, fit
+from jaxsand.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.settling import Outcome, Relaxation, Settled, Stop, as_batch, check_chunk, check_rule, relax, wide_vectors
 from jaxsand.tool import Pose
 
@@ -55,7 +55,7 @@ def step(
     zero where nothing changes (a stroke off the map, a tool above the sand). Continuous in the stroke, except where its
     length goes to zero and its heading is lost.
     """
-    height = jnp.asarray(height)
+    height = as_array("height", height)
     return follow(scene, height, _stroke(stroke, height.dtype), push=push, scheme=scheme, stop=stop)
 
 
@@ -179,7 +179,7 @@ def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tupl
         raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps)")
     if not 0 < push.substep <= 1:
         raise ValueError(f"push.substep: got {push.substep!r}; give a part of a spacing, above 0 and at most 1")
-    if isinstance(push.sweeps, bool) or not isinstance(push.sweeps, int) or push.sweeps < 0:
+    if isinstance(push.sweeps, bool) or not isinstance(push.sweeps, int | np.integer) or push.sweeps < 0:
         raise ValueError(f"push.sweeps: got {push.sweeps!r}; give a whole number of at least 0")
     try:
         check_rule(scene, Relaxation(push.rate), None)
@@ -191,7 +191,7 @@ def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tupl
 
 
 def _stroke(stroke: Any, dtype: Any) -> jax.Array:
-    stroke = jnp.asarray(stroke, dtype)
+    stroke = as_array("stroke", stroke, dtype)
     if stroke.shape != (4,):
         remedy = "use jax.vmap" if stroke.ndim > 1 and stroke.shape[-1] == 4 else "give x0, y0, x1, y1 in metres"
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
@@ -199,7 +199,7 @@ def _stroke(stroke: Any, dtype: Any) -> jax.Array:
 
 
 def _path(path: Any, dtype: Any) -> jax.Array:
-    path = jnp.asarray(path, dtype)
+    path = as_array("path", path, dtype)
     if path.ndim != 2 or path.shape[0] < 2 or path.shape[1] != 2:
         remedy = "use jax.vmap" if path.ndim > 2 else "give at least two points [n, 2] of x, y in metres"
         raise ValueError(f"path: got shape {list(path.shape)}; {remedy}")

@@ -23,8 +23,8 @@ from jaxsand.grid import Neighbours, links
 from jaxsand.scene import Scene
 from jaxsand.walls import Draining, Walls
 
-Lost = jax.Array | None
-SHUT = 1e-6  # an open share of a cell below this counts as none
+Lost = tuple[jax.Array, jax.Array] | None
+NARROW = 0.05  # in an open share below this sand stands no higher than it would in this one
 
 
 @jax.tree_util.register_dataclass
@@ -62,8 +62,8 @@ class Around:
     """A tool standing in the sand; see `stand`.
 
     A cell of mean height h above the tool's bottom b holds that sand in its open share, where it stands at
-    h + stretch (h - b), stretch = cover / open. A link is as open as the less open of its two cells, which keeps a sweep
-    stable for any cover.
+    h + stretch (h - b), stretch = cover / open (in a sliver less, so that the flow out of it ends as it closes). A link is
+    as open as the less open of its two cells, which keeps a sweep stable for any cover.
     """
 
     open: jax.Array  # [H + 2, W + 2]
@@ -77,8 +77,7 @@ class Around:
 def stand(cover: jax.Array, bottom: jax.Array) -> Around:
     """A tool with its bottom at height `bottom` (m) that covers the share `cover` [H, W] of each cell."""
     free = 1 - cover
-    shut = free < SHUT
-    return Around(halo(free, 0.0), jnp.where(shut, 0, cover / jnp.where(shut, 1, free)), bottom)
+    return Around(halo(free, 0.0), cover / jnp.maximum(free, NARROW), bottom)
 
 
 @jax.tree_util.register_dataclass
@@ -154,7 +153,7 @@ def at(u: jax.Array, di: int = 0, dj: int = 0) -> jax.Array:
 def sweep(bed: Bed, flow: Flow, around: Around | Nothing, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
     """One sweep of a map with halo [H + 2, W + 2].
 
-    `lost` [H, W] gathers the height that left each cell over a draining rim; None where nothing drains.
+    `lost` gathers the height that left each cell over a draining rim (see `lose`); None where nothing drains.
     """
     s, gate = u, None
     if isinstance(around, Around):
@@ -174,8 +173,29 @@ def sweep(bed: Bed, flow: Flow, around: Around | Nothing, u: jax.Array, lost: Lo
         if gate is not None:
             e = e * at(gate)
         out = truncate(e)
-        net, lost = net - out, lost + out * flow.quantum
+        net, lost = net - out, lose(flow, lost, out * flow.quantum)
     return halo(at(u) + net * flow.quantum), lost
+
+
+def lose(flow: Flow, lost: tuple[jax.Array, jax.Array], amount: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Adds whole quanta [H, W] to what was lost: (low, high), whose sum is exact far beyond the reach of one float."""
+    low, high = lost
+    low = low + amount
+    coarse = flow.quantum * 4096
+    carry = truncate(low / coarse) * coarse
+    return low - carry, high + carry
+
+
+def nothing_lost(scene: Scene, height: jax.Array) -> Lost:
+    """The start of the account of `lose`, if the scene drains."""
+    return (jnp.zeros_like(height), jnp.zeros_like(height)) if isinstance(scene.edge, Draining) else None
+
+
+def volume_lost(bed: Bed, lost: Lost) -> jax.Array:
+    """The volume that drained (m^3)."""
+    if lost is None:
+        return jnp.zeros_like(bed.spacing)
+    return (jnp.sum(lost[1]) + jnp.sum(lost[0])) * bed.spacing**2
 
 
 def worst_excess(bed: Bed, u: jax.Array) -> jax.Array:

@@ -69,7 +69,7 @@ def test_no_sand_inside_the_tool(dtype):
         pushed = js.act(scene(), level(dtype), stroke)
         x, y = centres(scene().grid, dtype)
         cover = coverage(BLADE, pushed.pose, x, y, jnp.asarray(DX, dtype))
-        inside = np.asarray(pushed.height)[np.asarray(cover) > 0.999]
+        inside = np.asarray(pushed.height)[np.asarray(cover) > 1 - 1e-6]
         assert inside.size >= 20
         assert inside.max() <= -BLADE.depth + (1e-8 if dtype == "float32" else 1e-15)
 
@@ -185,6 +185,9 @@ def test_the_result_is_continuous_in_the_stroke():
     sand = js.make_scene((32, 32), 0.01, ANGLE, tool=js.Blade())
     run = jax.jit(jax.vmap(lambda s: js.act(sand, jnp.zeros((32, 32)), s).height))
     base = np.array([0.08, 0.1, 0.2, 0.17])
+    for near, far in (((0.1, 0.16, 0.42, 0.16),) * 2, ((0.1, 0.16, 0.3125, 0.16),) * 2, ((-0.5, 0.16, 0.82, 0.16),) * 2):
+        maps = run(jnp.asarray([near, np.add(far, [0, 1e-6, 0, 1e-6]), np.add(far, [0, 0, 0, 1e-6])]))
+        assert np.abs(maps - maps[:1]).max() < 5e-5  # a blade in line with the cells, up to and over a closed edge
     for direction in ([0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1], [1, 1, 1, 1], [0, 1, 0, -1]):
         for step, first in ((1e-4, 0.0), (1e-6, 0.0), (1e-6, 0.0049)):
             k = np.arange(160)[:, None]
@@ -208,10 +211,13 @@ def test_a_tool_that_is_not_finite_is_flagged():
         assert np.array_equal(out.height, level())
 
 
-def test_strokes_from_very_far_reach_the_map():
-    out = js.step(scene(), level("float32"), (0.2, 0.16, 3e30, 0.16))
-    js.check(out)
-    assert float(out.height.min()) == pytest.approx(-BLADE.depth, rel=1e-3)
+def test_strokes_from_far_reach_the_map_or_are_flagged():
+    for far in (1e3, 1e6):
+        out = js.step(scene(), level("float32"), (0.2, 0.16, far, 0.16))
+        js.check(out)
+        assert float(out.height.min()) == pytest.approx(-BLADE.depth, rel=1e-3)
+    out = js.step(scene(), level("float32"), (-1e20, 0.16, 1e20, 0.16))
+    assert int(out.outcome) == js.Outcome.NOT_FINITE
 
 
 def test_sand_before_a_wall_stays_in_its_column_until_the_blade_is_lifted():

@@ -250,6 +250,13 @@ def test_cliffs_and_spikes_of_a_million_cells(dtype, height):
     assert int(s.outcome) in (0, js.Outcome.NOT_STILL)
 
 
+def test_draining_keeps_account_of_every_quantum():
+    h = np.full((49, 49), 1.0, "float32")
+    s = js.settle(js.make_scene(h.shape, 1 / 49, ANGLE, edge=js.Draining(0.0)), h)
+    left = (math.fsum(h.ravel().astype(float)) - math.fsum(np.asarray(s.height, float).ravel())) / 49**2
+    assert float(s.drained) == pytest.approx(left, rel=3e-7)
+
+
 def test_nothing_falls_below_a_draining_rim():
     h = np.zeros((1, 32))
     h[0, 12:20] = 0.1
