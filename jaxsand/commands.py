@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 def run_shape(options: argparse.Namespace) -> None:
     tell = progress()
+    started = time.perf_counter()
     tell("reading the goal")
     from jaxsand.render import save_animation, save_figure, shape_figure
     from jaxsand.shaping import shape
@@ -36,7 +37,10 @@ def run_shape(options: argparse.Namespace) -> None:
         save_figure(shape_figure(result), path)
     with written(files["shape.gif"]) as path:
         save_animation(result, path)
+    if target.method == "strokes":  # a glyph's goal is pushed first, by the same program
+        planned -= result.seconds["compile"]
     report = _report(result, planned, time.perf_counter() - began, files)
+    report["seconds"] = time.perf_counter() - started
     with written(files["result.json"]) as path:
         path.write_text(_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
@@ -54,7 +58,7 @@ def _report(result: "ShapeResult", planned: float, drawn: float, files: dict[str
         "steps": result.steps,
         **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
         **result.figures,
-        "seconds": planned + drawn + sum(seconds.values()),
+        "seconds": 0.0,
         "seconds_plan": planned + seconds["prepare"],
         "seconds_compile": seconds["compile"],
         "seconds_run": seconds["run"],

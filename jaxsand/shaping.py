@@ -154,7 +154,7 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
     beyond = max(0.0, placed[:, [0, 2]].max() - task.GLYPH_SQUARE[1])
     scene = make_scene((32, 32 + math.ceil(beyond / spacing - 1e-6)), spacing, tool=blade)
     paths = tuple(stroke.reshape(2, 2) for stroke in placed)
-    goal, program = np.zeros(scene.grid.shape, np.float32), _program(scene, 2)
+    goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, 2)
     for path in paths:
         shaped, _ = program(jnp.asarray(goal), jnp.asarray(path, np.float32))
         check(shaped)
@@ -197,7 +197,7 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
     longest = max(len(path) for path in target.paths)
     if longest > 2:  # a few lengths for all paths, so that like goals share a program
         longest = -(-longest // 32) * 32
-    program = _program(scene, longest)
+    program, compile_seconds = _program(scene, longest)
     compiled = time.perf_counter()
     height, frames, tools = start, [start], [_nowhere()]
     runs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -215,7 +215,7 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
         ways, poses = _moments(scene, earlier, path, legs)
         frames += [*ways, later]
         tools += [*poses, _nowhere()]
-    seconds = {"prepare": prepared - began, "compile": compiled - prepared, "run": ran - compiled}
+    seconds = {"prepare": prepared - began, "compile": compile_seconds, "run": ran - compiled}
     figures = _figures(target, start, height)
     return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), figures, seconds)
 
@@ -235,12 +235,13 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
 
 
 @cache
-def _program(scene: Scene, points: int) -> Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]]:
-    """`follow_frames` for paths of a given number of points, compiled ahead so that its time can be told apart."""
+def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]], float]:
+    """`follow_frames` for paths of a given number of points, compiled ahead, and the seconds that took."""
+    began = time.perf_counter()
     height = jax.ShapeDtypeStruct(scene.grid.shape, np.float32)
     path = jax.ShapeDtypeStruct((points, 2), np.float32)
     program: Callable = jax.jit(partial(follow_frames, scene)).lower(height, path).compile()
-    return program
+    return program, time.perf_counter() - began
 
 
 def _padded(path: np.ndarray, points: int) -> np.ndarray:

@@ -74,7 +74,7 @@ BAD = {
     "half a window": (made(window=js.Window((4.5, 4.5))), r"window\.size: got \(4.5, 4.5\)"),
     "endless shape": (made((np.inf, 4)), "shape: got"),
     "many neighbours": (made(SHAPE, 0.01, 0.5, np.array([4, 8])), "neighbours: got"),
-    "nearly a right angle": (lambda: js.settle(js.make_scene(SHAPE, 0.01, np.pi / 2 - 1e-9), LEVEL), "repose_angle: got an angle that is pi/2 in float32"),
+    "nearly a right angle": (lambda: js.settle(js.make_scene(SHAPE, 0.01, np.pi / 2 - 1e-9), LEVEL), "repose_angle: got an angle of pi/2 in float32"),
     "words for sand": (lambda: js.settle(SAND, "sand"), "height: got str, no array of numbers"),
     "words for a stroke": (lambda: js.step(SAND, LEVEL, "abcd"), "stroke: got str"),
     "volume of whole numbers": (lambda: js.volume(SAND, np.zeros(SHAPE, int)), "height: got dtype int64"),
