@@ -39,15 +39,15 @@ def run_shape(options: argparse.Namespace) -> None:
         save_animation(result, path)
     if target.method == "strokes":  # a glyph's goal is pushed first, by the same program
         planned -= result.seconds["compile"]
-    report = _report(result, planned, time.perf_counter() - began, files)
-    report["seconds"] = time.perf_counter() - started
+    ended = time.perf_counter()
+    report = _report(result, ended - started, planned, ended - began, files)
     with written(files["result.json"]) as path:
         path.write_text(_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     _print(options, report, _summary)
 
 
-def _report(result: "ShapeResult", planned: float, drawn: float, files: dict[str, Path]) -> dict[str, Any]:
+def _report(result: "ShapeResult", total: float, planned: float, drawn: float, files: dict[str, Path]) -> dict[str, Any]:
     target, seconds = result.target, result.seconds
     return {
         "goal": target.name,
@@ -58,7 +58,7 @@ def _report(result: "ShapeResult", planned: float, drawn: float, files: dict[str
         "steps": result.steps,
         **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
         **result.figures,
-        "seconds": 0.0,
+        "seconds": total,
         "seconds_plan": planned + seconds["prepare"],
         "seconds_compile": seconds["compile"],
         "seconds_run": seconds["run"],

@@ -159,23 +159,28 @@ def check_rule(scene: Scene, scheme: Relaxation | None, stop: Stop | None) -> tu
     stop = UntilStill() if stop is None else stop
     if not isinstance(scheme, Relaxation):
         raise ValueError(f"scheme: got {scheme!r}; give Relaxation(rate)")
-    rate = concrete(scheme.rate)
-    limit = _stable_rate(scene)
-    if rate is not None and not (rate > 0).all():
-        raise ValueError(f"scheme.rate: got {scheme.rate!r}; give a positive share such as 0.125")
-    if rate is not None and not (rate <= limit).all():
-        raise ValueError(f"scheme.rate: got {scheme.rate!r}, unstable above {limit:.4f}; the paper uses 0.125")
+    check_rate(scene, "scheme.rate", scheme.rate)
     if isinstance(stop, UntilStill):
         for name, count in (("bound", stop.bound), ("interval", stop.interval)):
-            _whole(f"stop.{name}", count, 1)
+            check_whole(f"stop.{name}", count, 1)
     elif isinstance(stop, Sweeps):
-        _whole("stop.count", stop.count, 0)
+        check_whole("stop.count", stop.count, 0)
     else:
         raise ValueError(f"stop: got {stop!r}; give UntilStill() or Sweeps(count)")
     tolerance = concrete(stop.tolerance)
     if tolerance is not None and not ((tolerance >= 0) & (tolerance < float("inf"))).all():
         raise ValueError(f"stop.tolerance: got {stop.tolerance!r}; give a slope of 0 or more, such as 1e-3")
     return scheme, stop
+
+
+def check_rate(scene: Scene, name: str, value: jax.typing.ArrayLike) -> None:
+    """Raises ValueError unless a rate is positive and in the scene's stable range."""
+    rate = concrete(value)
+    limit = _stable_rate(scene)
+    if rate is not None and not (rate > 0).all():
+        raise ValueError(f"{name}: got {value!r}; give a positive share such as 0.125")
+    if rate is not None and not (rate <= limit).all():
+        raise ValueError(f"{name}: got {value!r}, unstable above {limit:.4f}; the paper uses 0.125")
 
 
 def _stable_rate(scene: Scene) -> float:
@@ -195,10 +200,11 @@ def as_batch(height: jax.typing.ArrayLike) -> jax.Array:
 
 def check_chunk(chunk: int) -> None:
     """Raises ValueError unless `chunk` is a number of maps."""
-    _whole("chunk", chunk, 1)
+    check_whole("chunk", chunk, 1)
 
 
-def _whole(name: str, value: Any, least: int) -> None:
+def check_whole(name: str, value: Any, least: int) -> None:
+    """Raises ValueError unless the value is a whole number of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: got {value!r}; give a whole number of at least {least}")
 

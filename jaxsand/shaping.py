@@ -115,8 +115,7 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
     The map is planned on blocks of `layout.cell` grid cells, of which those are dug whose mean lies deep enough.
     """
     goal = np.asarray(goal, float)
-    if not np.all(np.isfinite(goal)):
-        raise ValueError(f"goal: got {int(np.sum(~np.isfinite(goal)))} cells that are not finite; fill them first")
+    task.finite(goal)
     rows, columns = (n // layout.cell for n in goal.shape)
     if not rows or not columns:
         raise ValueError(
@@ -200,18 +199,17 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
     program, compile_seconds = _program(scene, longest)
     compiled = time.perf_counter()
     height, frames, tools = start, [start], [_nowhere()]
-    runs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    runs_after: list[np.ndarray] = []
+    runs = []
     for number, path in enumerate(target.paths, 1):
         tell(f"pushing path {number} of {len(target.paths)}")
         shaped, on_the_way = program(jnp.asarray(height), jnp.asarray(_padded(path, longest), np.float32))
         check(shaped)
-        runs.append((height, path, np.asarray(on_the_way)))
-        height = np.asarray(shaped.height)
-        runs_after.append(height)
+        later = np.asarray(shaped.height)
+        runs.append((height, path, np.asarray(on_the_way), later))
+        height = later
     ran = time.perf_counter()
     tell("gathering frames")
-    for (earlier, path, legs), later in zip(runs, runs_after, strict=True):
+    for earlier, path, legs, later in runs:
         ways, poses = _moments(scene, earlier, path, legs)
         frames += [*ways, later]
         tools += [*poses, _nowhere()]

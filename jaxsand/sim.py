@@ -10,7 +10,19 @@ import numpy as np
 
 from jaxsand.push import Pushed, SteppedPush, push_along
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
-from jaxsand.settling import Outcome, Relaxation, Settled, Stop, as_batch, check_chunk, check_rule, relax, wide_vectors
+from jaxsand.settling import (
+    Outcome,
+    Relaxation,
+    Settled,
+    Stop,
+    as_batch,
+    check_chunk,
+    check_rate,
+    check_rule,
+    check_whole,
+    relax,
+    wide_vectors,
+)
 from jaxsand.tool import Pose
 
 
@@ -179,12 +191,8 @@ def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tupl
         raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps)")
     if not 0 < push.substep <= 1:
         raise ValueError(f"push.substep: got {push.substep!r}; give a part of a spacing, above 0 and at most 1")
-    if isinstance(push.sweeps, bool) or not isinstance(push.sweeps, int | np.integer) or push.sweeps < 0:
-        raise ValueError(f"push.sweeps: got {push.sweeps!r}; give a whole number of at least 0")
-    try:
-        check_rule(scene, Relaxation(push.rate), None)
-    except ValueError as error:
-        raise ValueError(str(error).replace("scheme.rate", "push.rate")) from None
+    check_whole("push.sweeps", push.sweeps, 0)
+    check_rate(scene, "push.rate", push.rate)
     scheme, stop = check_rule(scene, scheme, stop)
     scene, height = fit(scene, height)
     return scene, height, cast((push, scheme, stop), height.dtype)

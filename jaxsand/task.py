@@ -106,5 +106,10 @@ def fits(scene: Scene, goal: np.ndarray) -> None:
             f"goal: got shape {list(goal.shape)}, the scene has {list(scene.grid.shape)}; "
             "make the scene as large, or use task.resample"
         )
+    finite(goal)
+
+
+def finite(goal: np.ndarray) -> None:
+    """Raises ValueError unless every cell of the goal is finite."""
     if not np.all(np.isfinite(goal)):
         raise ValueError(f"goal: got {int(np.sum(~np.isfinite(goal)))} cells that are not finite; fill them first")
