@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from jaxsand.commands import run_benchmark, run_plan, run_settle, run_shape
+from jaxsand.commands import SCHEMES, run_benchmark, run_plan, run_settle, run_shape
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -58,8 +58,8 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--out-file", type=Path, required=True, metavar="OUT.npy")
     p.add_argument("--spacing", type=_number, default=0.01, metavar="M", help="grid spacing in m (0.01)")
     p.add_argument("--repose-deg", type=_number, default=29.0, help="angle of repose (29)")
-    p.add_argument("--neighbours", type=int, choices=[4, 8], default=8)
-    p.add_argument("--scheme", choices=["relaxation"], default="relaxation", help="the paper's sweep at k = dx^2/8")
+    p.add_argument("--neighbours", type=_neighbours, choices=[4, 8, "isotropic"], default=8, help="4, 8 or isotropic (8)")
+    p.add_argument("--scheme", choices=SCHEMES, default="super-time-stepping", help="relaxation: the paper's sweep")
     p.add_argument("--tol", type=_number, default=1e-3, help="largest slope in excess of repose, a tangent (1e-3)")
     p.add_argument("--bound", type=_count, default=200_000, help="most sweeps (200000)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
@@ -72,10 +72,11 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_plan)
 
-    p = commands.add_parser("bench", help="speed, side by side with plain numpy and plain C")
-    p.add_argument("what", nargs="?", choices=["settle", "push", "all", "letters"], default="all")
+    p = commands.add_parser("bench", help="error against run time, and speed beside plain numpy and plain C")
+    p.add_argument("what", nargs="?", choices=["settle", "push", "all", "stability", "letters"], default="all")
     p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report")
+    p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report and its figure")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_benchmark)
     return parser
@@ -97,6 +98,10 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"got {text!r}, which is no number") from None
+
+
+def _neighbours(text: str) -> int | str:
+    return int(text) if text.isdecimal() else text
 
 
 def _count(text: str) -> int:

@@ -19,13 +19,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import goals
+from jaxsand import analysis, goals, stability, workprec
+from jaxsand.analysis import random_strokes
+from jaxsand.files import as_table
 from jaxsand.plain import compile_c, settle_numpy
 from jaxsand.push import SteppedPush
 from jaxsand.scene import Scene, make_scene
+from jaxsand.schemes import Relaxation, SuperTimeStepping
 from jaxsand.settling import Settled, Sweeps, UntilStill, settle, settle_batch
 from jaxsand.shaping import Layout, glyph_target, map_target, shape
 from jaxsand.sim import act, step, step_batch
+from jaxsand.swath import SwathPush
 from jaxsand.tool import Blade
 from jaxsand.window import Window
 
@@ -38,13 +42,30 @@ _NUMPY = "numpy, one map at a time"
 _C = "C loop, one core"
 
 
-def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None) -> dict[str, Any]:
-    """The figures for `what`: settle, push or both (all), on maps of 32 x 32 cells; or letters."""
+def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int = 3) -> dict[str, Any]:
+    """The figures for `what`: settle, push or both (all), stability, or letters.
+
+    Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
+    """
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
+        report["peer"] = analysis.peer(max(1, batch // 16), tell)
+        if grids:
+            report["reference"] = workprec.reference_check(tell)
+            report["work_precision"] = workprec.work_precision((*workprec.STIFF, workprec.RIDGE), tell, grids)
+            report["time_to_1_percent"] = workprec.time_to(report["work_precision"])
+            report["growth"] = workprec.growth(report["time_to_1_percent"])
+            report["sweeps_by_rate"] = analysis.sweeps_against_rate()
+            report["sweeps_by_resolution"] = analysis.sweeps_against_resolution()
+            report["activity"] = [analysis.activity()]
     if what in ("push", "all"):
         report["push"] = bench_push(max(1, batch // 4), tell)
+        if grids:
+            report["push_precision"] = analysis.push_precision(max(1, batch // 64), tell)
+            report["push_by_spacing"] = analysis.push_against_spacing(tell)
+    if what == "stability":
+        report["stability"] = stability.stability(tell=tell)
     if what == "letters":
         report["letters"] = bench_letters(tell)
     return report
@@ -63,7 +84,7 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
     """Settling maps in which a random push has just ended.
 
     `error` is the largest distance, over the first maps, of the settled map from the limit of small steps (float64, rate
-    1/64, tolerance 1e-6), divided by the largest change of height.
+    1/64, tolerance 1e-6), divided by the largest change of height. numpy and C run the paper's sweep at rate 1/8.
     """
     scene, heights = _pushed(batch)
     host = np.asarray(heights)
@@ -82,8 +103,13 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
     ways = {
         "settle_batch": Way(lambda: ours(settle_batch(scene, heights)), batch, cores),
         "settle_batch, tolerance 1e-2": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, cores),
-        "settle_batch, tolerance 1e-4": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-4))), batch, cores),
-        f"settle_batch, {fixed} sweeps": Way(lambda: ours(settle_batch(scene, heights, stop=Sweeps(fixed))), batch, cores),
+        "settle_batch, growth 0.8": Way(
+            lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8))), batch, cores
+        ),
+        "settle_batch, paper's sweep": Way(lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, cores),
+        f"settle_batch, {fixed} of the paper's sweeps": Way(
+            lambda: ours(settle_batch(scene, heights, scheme=Relaxation(), stop=Sweeps(fixed))), batch, cores
+        ),
         "vmap(settle)": Way(lambda: ours(vmapped(heights)), batch, cores),
         _NUMPY: Way(plain, sample),
     }
@@ -132,13 +158,13 @@ def bench_push(batch: int, tell: Tell = lambda _: None, sample: int = 64) -> lis
     """
     scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
     near = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade(), window=Window((16, 16)))
-    level, strokes = jnp.zeros((batch, _CELLS, _CELLS), jnp.float32), _strokes(batch)
+    level, strokes = jnp.zeros((batch, _CELLS, _CELLS), jnp.float32), random_strokes(batch)
     vmapped = jax.jit(jax.vmap(partial(step, scene)))
     alone = jax.jit(partial(step, scene))
     sample = min(sample, batch)
     few = min(16, sample)
 
-    def batched(sand: Scene, push: SteppedPush | None = None) -> Way:
+    def batched(sand: Scene, push: SteppedPush | SwathPush | None = None) -> Way:
         return Way(lambda: (None, step_batch(sand, level, strokes, push=push).height[:sample]), batch, _cores())
 
     ways = {
@@ -148,6 +174,7 @@ def bench_push(batch: int, tell: Tell = lambda _: None, sample: int = 64) -> lis
         "step_batch, sub-step 1/4": batched(scene, SteppedPush(0.25, 8)),
         "step_batch, sub-step 1": batched(scene, SteppedPush(1.0, 8)),
         "step_batch, window 16 x 16": batched(near),
+        "step_batch, swath": batched(scene, SwathPush()),
         "vmap(step)": Way(lambda: (None, vmapped(level, strokes).height[:sample]), batch, _cores()),
         "step, one map at a time": Way(lambda: (None, jnp.stack([alone(level[0], s).height for s in strokes[:few]])), few),
     }
@@ -199,19 +226,10 @@ def bench_letters(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
 
 def table(report: dict[str, Any]) -> str:
     """The report as text."""
-    lines = [report["machine"]]
-    if "settle" in report or "push" in report:
-        lines.append(f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32")
-    for what in ("settle", "push", "letters"):
-        rows = report.get(what)
-        if not rows:
-            continue
-        names = [n for n in dict.fromkeys(n for row in rows for n in row) if n != "name"]
-        lines.append("")
-        first = max(len(row["name"]) for row in rows) + 2
-        wide = {n: max(10, len(n) + 2) for n in names}
-        lines.append(what.ljust(first) + "".join(n.replace("_", " ").rjust(wide[n]) for n in names))
-        lines += [row["name"].ljust(first) + "".join(f"{row[n]:{wide[n]}.4g}" for n in names) for row in rows]
+    lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
+    for what, rows in report.items():
+        if isinstance(rows, list) and what not in ("map", "work_precision"):
+            lines += ["", *as_table(rows, what.replace("_", " "))]
     return "\n".join(lines)
 
 
@@ -243,14 +261,10 @@ def _compare(rows: list[dict[str, Any]], rival: str, figure: str, name: str, *, 
 def _pushed(batch: int) -> tuple[Scene, jax.Array]:
     scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
     level = jnp.zeros((_CELLS, _CELLS), jnp.float32)
-    pushed = jax.jit(lambda s: jax.lax.map(lambda one: act(scene, level, one).height, s, batch_size=64))(_strokes(batch))
+    pushed = jax.jit(lambda s: jax.lax.map(lambda one: act(scene, level, one).height, s, batch_size=64))(
+        random_strokes(batch)
+    )
     return make_scene((_CELLS, _CELLS), _SPACING, _ANGLE), jax.block_until_ready(pushed)
-
-
-def _strokes(batch: int) -> jax.Array:
-    """Random strokes between points of the middle four fifths of the map (m)."""
-    side = _CELLS * _SPACING
-    return jax.random.uniform(jax.random.key(0), (batch, 4), jnp.float32, minval=0.1 * side, maxval=0.9 * side)
 
 
 def _cores() -> int:

@@ -1,7 +1,6 @@
 """What the commands do, once their arguments are read."""
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -9,12 +8,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxsand.files import existing, folder, progress, read_text, written
+from jaxsand.files import as_json, existing, folder, progress, read_text, written
 
 if TYPE_CHECKING:
     import numpy as np
 
     from jaxsand.shaping import Layout, ShapeResult, Target
+
+
+SCHEMES = ("relaxation", "pairwise", "super-time-stepping", "multilevel")
 
 
 def run_shape(options: argparse.Namespace) -> None:
@@ -42,7 +44,7 @@ def run_shape(options: argparse.Namespace) -> None:
     ended = time.perf_counter()
     report = _report(result, ended - started, planned, ended - began, files)
     with written(files["result.json"]) as path:
-        path.write_text(_json(report, indent=1) + "\n", encoding="utf-8")
+        path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     _print(options, report, _summary)
 
@@ -181,19 +183,21 @@ def run_settle(options: argparse.Namespace) -> None:
         jax.config.update("jax_enable_x64", True)
     elif heights.dtype.kind != "f":
         heights = heights.astype(np.float32)
+    from jaxsand import schemes
     from jaxsand.scene import make_scene
-    from jaxsand.settling import Outcome, Relaxation, UntilStill, settle
+    from jaxsand.settling import Outcome, UntilStill, settle
     from jaxsand.sim import OutcomeError, check
     from jaxsand.task import volume_error
 
     if not np.all(np.isfinite(heights)):
         raise ValueError(f"{options.input}: got {np.sum(~np.isfinite(heights))} cells that are not finite; fill them first")
     scene = make_scene(heights.shape, options.spacing, math.radians(options.repose_deg), options.neighbours)
+    scheme = getattr(schemes, options.scheme.title().replace("-", ""))()
     stop = UntilStill(options.tol, bound=options.bound)
     folder(options.out_file.parent)
     tell("settling")
     began = time.perf_counter()
-    compiled = jax.jit(lambda h: settle(scene, h, scheme=Relaxation(), stop=stop)).lower(heights).compile()
+    compiled = jax.jit(lambda h: settle(scene, h, scheme=scheme, stop=stop)).lower(heights).compile()
     ready = time.perf_counter()
     settled = jax.block_until_ready(compiled(heights))
     ran = time.perf_counter() - ready
@@ -250,10 +254,15 @@ def run_benchmark(options: argparse.Namespace) -> None:
     out = folder(options.out) if options.out else None
     from jaxsand.benchmark import bench, table
 
-    report = bench(options.what, options.batch, tell)
+    report = bench(options.what, options.batch, tell, options.grids)
     if out:
+        if report.get("work_precision"):
+            from jaxsand.render import save_figure, work_precision_figure
+
+            with written(out / f"bench-{options.what}.png") as path:
+                save_figure(work_precision_figure(report["work_precision"]), path)
         with written(out / f"bench-{options.what}.json") as path:
-            path.write_text(_json(report, indent=1) + "\n", encoding="utf-8")
+            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     _print(options, report, table)
 
@@ -269,20 +278,7 @@ def _cell(text: str | None) -> tuple[int, int] | None:
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any], human: Callable[[dict[str, Any]], str]) -> None:
-    print(_json(report) if options.json else human(report))
-
-
-def _json(report: dict[str, Any], **layout: Any) -> str:
-    """JSON, with null for numbers that are not finite."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {name: plain(v) for name, v in value.items()}
-        if isinstance(value, list):
-            return [plain(v) for v in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(plain(report), allow_nan=False, **layout)
+    print(as_json(report) if options.json else human(report))
 
 
 def _lines(report: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ Whenever the share of a cell that the tool covers grows from a to b, the share (
 tool's bottom has to leave. It goes to neighbouring cells, to the one or two of the eight that lie in its direction, shared
 as the direction divides the angle between them; it comes to rest in their open share and moves on in the rest. Sand that
 has nowhere to go, at a wall or a closed edge, stays in its column until the tool leaves it; over a draining edge it is
-lost. Every amount is a whole number of quanta (see sweep.py), so that volume is kept as well as floats allow.
+lost. Every amount is a whole number of quanta (see bed.py), so that volume is kept as well as floats allow.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
+from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
+from jaxsand.flux import stand
 from jaxsand.loop import repeat_until
-from jaxsand.sweep import Bed, Flow, Lost, at, halo, lose, truncate
+from jaxsand.sweep import Flow, sweep
 from jaxsand.tool import Blade, Pose, local
 
 _EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
@@ -38,7 +41,7 @@ def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[j
     """Takes up the sand that has to leave as the cover grows: the height left and the height taken."""
     grown = cover > before
     share = jnp.where(grown, (cover - before) / jnp.where(grown, 1 - before, 1), 0)
-    taken = _whole(job, share * jnp.where(h > job.bottom, h - job.bottom, 0))
+    taken = whole(job, share * jnp.where(h > job.bottom, h - job.bottom, 0))
     return h - taken, taken
 
 
@@ -52,13 +55,13 @@ def pass_on(
     source = halo(carried, 0.0)
     received, kept = jnp.zeros_like(h), carried
     for (di, dj), s in zip(_EIGHT, share, strict=True):
-        given = _whole(job, s * carried) * at(room, di, dj)
+        given = whole(job, s * carried) * at(room, di, dj)
         kept = kept - given
         s_there = at(halo(s, 0.0), -di, -dj) if s.ndim else s
-        received = received + _whole(job, s_there * at(source, -di, -dj)) * at(room)
+        received = received + whole(job, s_there * at(source, -di, -dj)) * at(room)
         if job.bed.rim is not None and lost is not None:
-            lost = lose(job.flow, lost, given * at(job.bed.rim.beyond, di, dj))
-    rest = _whole(job, free * received)
+            lost = lose(job.flow.quantum, lost, given * at(job.bed.rim.beyond, di, dj))
+    rest = whole(job, free * received)
     return h + (rest + kept), lost, received - rest
 
 
@@ -91,6 +94,23 @@ def spread(job: Job, share: Shares, free: jax.Array, h: jax.Array, lost: Lost, c
     return h + carried, lost
 
 
+def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
+    """1 while the blade is among the sand, falling to 0 where it covers no cell or hangs a spacing above all it covers.
+
+    Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
+    """
+    near = jnp.clip(1 + (h - job.bottom) / job.bed.spacing, 0, 1)
+    return jnp.minimum(1, 2 * jnp.max(jnp.where(jnp.isnan(h), 0, near) * cover))
+
+
+def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+    """Sweeps the sand around a blade that covers the share `cover` of each cell."""
+    around = stand(cover, job.bottom)
+    state = (halo(h), lost)
+    h, lost = lax.fori_loop(0, sweeps, lambda _, s: sweep(job.bed, flow, around, *s), state)
+    return at(h), lost
+
+
 def _at_rest(params: Any, _: jax.Array, state: Any) -> jax.Array:
     return ~jnp.any(state[2] > 0)
 
@@ -99,5 +119,6 @@ def _onward(params: Any, _: jax.Array, state: Any) -> Any:
     return pass_on(*params, *state)
 
 
-def _whole(job: Job, amount: jax.Array) -> jax.Array:
+def whole(job: Job, amount: jax.Array) -> jax.Array:
+    """Cut to whole quanta."""
     return truncate(amount / job.flow.quantum) * job.flow.quantum

@@ -1,10 +1,13 @@
 """Files and folders of the command line, and its progress line."""
 
+import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 def existing(path: Path) -> Path:
@@ -50,3 +53,29 @@ def progress() -> Callable[[str], None]:
     if not sys.stderr.isatty():
         return lambda _: None
     return lambda text: print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def as_json(report: dict[str, Any], **layout: Any) -> str:
+    """JSON, with null for numbers that are not finite."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: plain(v) for name, v in value.items()}
+        if isinstance(value, list):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(report), allow_nan=False, **layout)
+
+
+def as_table(rows: list[dict[str, Any]], title: str) -> list[str]:
+    """Rows of figures as lines of text: what is text in a row names it, and None is a dash."""
+    texts = [" ".join(v for v in row.values() if isinstance(v, str)) for row in rows]
+    names = [n for n in dict.fromkeys(n for row in rows for n in row) if not isinstance(rows[0].get(n), str)]
+    first = max(len(title), *map(len, texts)) + 2
+    wide = {n: max(10, len(n) + 2) for n in names}
+    lines = [title.ljust(first) + "".join(n.replace("_", " ").rjust(wide[n]) for n in names)]
+    for text, row in zip(texts, rows, strict=True):
+        figures = ("-" if row.get(n) is None else f"{row[n]:.4g}" for n in names)
+        lines.append(text.ljust(first) + "".join(f.rjust(wide[n]) for f, n in zip(figures, names, strict=True)))
+    return lines

@@ -7,11 +7,12 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-Neighbours = Literal[4, 8]
+Neighbours = Literal[4, 8, "isotropic"]
+Link = tuple[int, int, float]
 
 _STRAIGHT = ((0, 1, 1.0), (1, 0, 1.0))
 _DIAGONAL = ((1, 1, math.sqrt(2.0)), (1, -1, math.sqrt(2.0)))
-_LINKS = {4: _STRAIGHT, 8: _STRAIGHT + _DIAGONAL}
+_LINKS = {4: _STRAIGHT, 8: _STRAIGHT + _DIAGONAL, "isotropic": _STRAIGHT}
 
 
 @jax.tree_util.register_dataclass
@@ -24,8 +25,9 @@ class Grid:
     neighbours: Neighbours = field(default=8, metadata={"static": True})
 
 
-def links(neighbours: Neighbours) -> tuple[tuple[int, int, float], ...]:
-    """Half of the links of a cell, each once: (rows, columns, length in spacings). The others are their negatives."""
+def links(neighbours: Neighbours) -> tuple[Link, ...]:
+    """Half of the links over which a cell exchanges sand: (rows, columns, length in spacings). The others are their
+    negatives."""
     return _LINKS[neighbours]
 
 

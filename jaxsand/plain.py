@@ -39,11 +39,12 @@ def settle_numpy(
     h = height.copy()
     kind = h.dtype.type
     nmant = np.finfo(h.dtype).nmant
-    quantum = kind(math.ldexp(1, math.frexp(float(np.abs(h).max()) or 1e-30)[1] - nmant))
-    limit = max(tolerance, 2 * float(quantum) / (rate * spacing)) * spacing
     drop = kind(mu * spacing)
     sweeps = 0
-    while sweeps < bound and _worst(h, drop) > limit:
+    while sweeps < bound:
+        quantum = kind(math.ldexp(1, math.frexp(float(np.abs(h).max()) or 1e-30)[1] - nmant))
+        if _worst(h, drop) <= max(tolerance, 2 * float(quantum) / (rate * spacing)) * spacing:
+            break
         for _ in range(interval):
             net = np.zeros_like(h)
             for di, dj, length in _LINKS:

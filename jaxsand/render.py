@@ -42,6 +42,29 @@ def shape_figure(result: ShapeResult) -> "Figure":
     return figure
 
 
+def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
+    """Error against run time of every scheme on every scene (rows) and grid (columns); a curve runs over tolerances."""
+    from matplotlib.figure import Figure
+
+    problems = list(dict.fromkeys(row["problem"] for row in rows))
+    schemes = list(dict.fromkeys(row["scheme"] for row in rows))
+    sides = {p: list(dict.fromkeys(row["cells"] for row in rows if row["problem"] == p)) for p in problems}
+    figure = Figure(figsize=(11, 2.9 * len(problems) + 0.8), layout="constrained")
+    axes = figure.subplots(len(problems), max(map(len, sides.values())), squeeze=False, sharey=True)
+    for line, problem in zip(axes, problems, strict=True):
+        for ax, cells in zip(line, sides[problem], strict=False):
+            for k, scheme in enumerate(schemes):
+                some = [r for r in rows if (r["problem"], r["cells"], r["scheme"]) == (problem, cells, scheme)]
+                ax.plot([r["seconds"] for r in some], [r["error"] for r in some], "osD^vPX"[k % 7] + "-", ms=4, label=scheme)
+            ax.axhline(0.01, color="gray", lw=0.8, ls=":")
+            ax.set(xscale="log", yscale="log", xlabel="run time (s)")
+            ax.xaxis.set_minor_formatter("")
+            ax.set_title(f"{problem}, {cells} cells", loc="left", fontsize=9)
+        line[0].set_ylabel("error / largest change")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
 def save_figure(figure: "Figure", path: Path) -> None:
     """Writes a PNG."""
     figure.savefig(path, dpi=110, format="png")

@@ -45,7 +45,7 @@ def make_scene(
       shape: rows and columns of the height map.
       spacing: distance of neighbouring cell centres, m.
       repose_angle: rad, above 0 and below pi/2; a scalar or one per cell [H, W].
-      neighbours: 4, or 8 (diagonal links are sqrt(2) spacings long).
+      neighbours: 4, 8 (diagonal links are sqrt(2) spacings long), or "isotropic" (repose holds for the gradient's length).
       tool, walls, edge, window: what the scene has of these; by default nothing.
 
     Raises:
@@ -54,10 +54,11 @@ def make_scene(
     shape = _shape(shape)
     _positive("spacing", spacing, "give the distance of cell centres in metres, such as 0.01")
     _angle(repose_angle, shape)
-    if not isinstance(neighbours, int | np.integer) or neighbours not in (4, 8):
-        raise ValueError(f"neighbours: got {neighbours!r}; choose 4 or 8")
+    known = neighbours == "isotropic" if isinstance(neighbours, str) else isinstance(neighbours, int | np.integer)
+    if not known or neighbours not in (4, 8, "isotropic"):
+        raise ValueError(f'neighbours: got {neighbours!r}; choose 4, 8 or "isotropic"')
     scene = Scene(
-        Grid(_number(spacing), shape, 4 if neighbours == 4 else 8),
+        Grid(_number(spacing), shape, neighbours if isinstance(neighbours, str) else 4 if neighbours == 4 else 8),
         Material(_number(repose_angle)),
         Open() if walls is None else _as_walls(walls),
         Closed() if edge is None else edge,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import IntFlag
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -10,29 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.loop import repeat_until
+from jaxsand.bed import at, halo, mark, nothing_lost, prepare, sound, spoiled, unmark, volume_lost
+from jaxsand.flux import Nothing, steepest, worst_excess
+from jaxsand.levels import descend, start
+from jaxsand.march import march
 from jaxsand.scene import Scene, cast, concrete, fit
-from jaxsand.sweep import (
-    Bed,
-    Flow,
-    Lost,
-    Nothing,
-    at,
-    halo,
-    largest,
-    mark,
-    nothing_lost,
-    prepare,
-    quantum,
-    sound,
-    spoiled,
-    steepest,
-    sweep,
-    unmark,
-    volume_lost,
-    worst_excess,
+from jaxsand.schemes import (
+    Multilevel,
+    Pairwise,
+    Relaxation,
+    Scheme,
+    SuperTimeStepping,
+    schedule,
+    stable_rate,
 )
-from jaxsand.walls import Draining
 
 
 class Outcome(IntFlag):
@@ -45,20 +36,6 @@ class Outcome(IntFlag):
     NOT_FINITE = 4
     """The map, the stroke or the scene holds a NaN or an infinity, the heights overflowed, or the stroke lies farther away
     than the floats resolve. A bad cell of the map was treated as solid and given back as it was."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Relaxation:
-    """The paper's sweep (arXiv:1908.02745, Eq. 1-2) with flow rate k = rate dx^2; first order in the rate.
-
-    With 8 neighbours it is stable for rate < 1/4.83 and a convex combination of neighbouring heights (no overshoot: the
-    highest point never rises, the lowest never falls) up to 1/6.83; with 4 neighbours for both up to 1/4, on a map of one
-    row or column up to 1/2 (1/4 if its edge drains). The default is the paper's dx^2/8. The settled map
-    depends slightly on the rate.
-    """
-
-    rate: jax.Array | float = 0.125
 
 
 @jax.tree_util.register_dataclass
@@ -105,7 +82,7 @@ def settle(
     scene: Scene,
     height: jax.typing.ArrayLike,
     *,
-    scheme: Relaxation | None = None,
+    scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Settled:
     """Lets a map [H, W] (m) settle to its angle of repose. One map; batch with `jax.vmap` or `settle_batch`.
@@ -128,7 +105,7 @@ def settle_batch(
     scene: Scene,
     height: jax.typing.ArrayLike,
     *,
-    scheme: Relaxation | None = None,
+    scheme: Scheme | None = None,
     stop: Stop | None = None,
     chunk: int = 256,
 ) -> Settled:
@@ -153,18 +130,18 @@ def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     return steepest(prepare(scene), halo(marked))
 
 
-def check_rule(scene: Scene, scheme: Relaxation | None, stop: Stop | None) -> tuple[Relaxation, Stop]:
-    """The scheme and stop rule, by default Relaxation() and UntilStill(), if they are in range."""
-    scheme = Relaxation() if scheme is None else scheme
+def check_rule(scene: Scene, scheme: Scheme | None, stop: Stop | None) -> tuple[Scheme, Stop]:
+    """The scheme and stop rule, by default SuperTimeStepping() and UntilStill(), if they are in range."""
+    scheme = SuperTimeStepping() if scheme is None else scheme
     stop = UntilStill() if stop is None else stop
-    if not isinstance(scheme, Relaxation):
-        raise ValueError(f"scheme: got {scheme!r}; give Relaxation(rate)")
-    check_rate(scene, "scheme.rate", scheme.rate)
+    _check_scheme(scene, scheme)
     if isinstance(stop, UntilStill):
         for name, count in (("bound", stop.bound), ("interval", stop.interval)):
             check_whole(f"stop.{name}", count, 1)
     elif isinstance(stop, Sweeps):
         check_whole("stop.count", stop.count, 0)
+        if isinstance(scheme, Multilevel):
+            raise ValueError("stop: got Sweeps with Multilevel, which settles until still; give UntilStill()")
     else:
         raise ValueError(f"stop: got {stop!r}; give UntilStill() or Sweeps(count)")
     tolerance = concrete(stop.tolerance)
@@ -173,21 +150,35 @@ def check_rule(scene: Scene, scheme: Relaxation | None, stop: Stop | None) -> tu
     return scheme, stop
 
 
+def _check_scheme(scene: Scene, scheme: Scheme) -> None:
+    if isinstance(scheme, Relaxation):
+        check_rate(scene, "scheme.rate", scheme.rate)
+    elif isinstance(scheme, Pairwise):
+        share = concrete(scheme.share)
+        if share is not None and not ((share > 0) & (share <= 1)).all():
+            raise ValueError(f"scheme.share: got {scheme.share!r}; give a share above 0 and up to 1")
+        if scene.grid.neighbours == "isotropic":
+            raise ValueError("scheme: got Pairwise with isotropic sand, which does not flow in pairs; use 4 or 8 neighbours")
+    elif isinstance(scheme, SuperTimeStepping | Multilevel):
+        for name, value, most in (("growth", scheme.growth, 4), ("first", scheme.first, 1), ("safety", scheme.safety, 1)):
+            if not 0 < value <= most:
+                raise ValueError(f"scheme.{name}: got {value!r}; give a number above 0 and up to {most}")
+        if isinstance(scheme, Multilevel):
+            check_whole("scheme.coarsest", scheme.coarsest, 2)
+            if not 1 <= scheme.handover < float("inf"):
+                raise ValueError(f"scheme.handover: got {scheme.handover!r}; give a time of at least 1, such as 128")
+    else:
+        raise ValueError(f"scheme: got {scheme!r}; give Relaxation, Pairwise, SuperTimeStepping or Multilevel")
+
+
 def check_rate(scene: Scene, name: str, value: jax.typing.ArrayLike) -> None:
     """Raises ValueError unless a rate is positive and in the scene's stable range."""
     rate = concrete(value)
-    limit = _stable_rate(scene)
+    limit = stable_rate(scene)
     if rate is not None and not (rate > 0).all():
         raise ValueError(f"{name}: got {value!r}; give a positive share such as 0.125")
     if rate is not None and not (rate <= limit).all():
         raise ValueError(f"{name}: got {value!r}, unstable above {limit:.4f}; the paper uses 0.125")
-
-
-def _stable_rate(scene: Scene) -> float:
-    """The rate above which the checkerboard (in one dimension: the saw-tooth) grows."""
-    if 1 in scene.grid.shape:
-        return 1 / 4 if isinstance(scene.edge, Draining) else 1 / 2
-    return {4: 1 / 4, 8: 1 / (2 + 2 * 2**0.5)}[scene.grid.neighbours]
 
 
 def as_batch(height: jax.typing.ArrayLike) -> jax.Array:
@@ -209,48 +200,36 @@ def check_whole(name: str, value: Any, least: int) -> None:
         raise ValueError(f"{name}: got {value!r}; give a whole number of at least {least}")
 
 
-def relax(scene: Scene, height: jax.Array, scheme: Relaxation, stop: Stop) -> Settled:
+def relax(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop) -> Settled:
     """`settle` without its checks and casts, for use inside a program."""
     bed = prepare(scene)
     marked, broken = mark(scene, height)
-    flow = Flow(jnp.asarray(scheme.rate), quantum(largest(marked)))
-    state, sweeps = _run(bed, flow, stop, (halo(marked), nothing_lost(scene, height)))
-    residual = worst_excess(bed, state[0])
-    settled = unmark(at(state[0]), height)
-    broken = broken | spoiled(marked, at(state[0])) | ~sound(bed)
-    outcome = Outcome.NOT_STILL * (residual > stop.tolerance) + Outcome.NOT_FINITE * broken
-    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), volume_lost(bed, state[1]))
-
-
-def _run(bed: Bed, flow: Flow, stop: Stop, state: tuple[jax.Array, Lost]) -> tuple[Any, jax.Array]:
+    sand = (halo(marked), nothing_lost(bed, height))
+    tolerance = jnp.asarray(stop.tolerance)
+    limit = stable_rate(scene)
     if isinstance(stop, Sweeps):
-        return repeat_until(_never, partial(_some_sweeps, 1), stop.count, (bed, flow, stop.tolerance), state)
-    # Below this slope every flux is cut to nothing.
-    floor = 2 * flow.quantum / (flow.rate * bed.spacing)
-    limit = jnp.maximum(stop.tolerance, lax.stop_gradient(floor))
-    interval = min(stop.interval, stop.bound)
-    state, looks = repeat_until(_still, partial(_some_sweeps, interval), stop.bound // interval, (bed, flow, limit), state)
-    return state, looks * interval
-
-
-def _still(params: Any, _: jax.Array, state: Any) -> jax.Array:
-    bed, _, limit = params
-    return worst_excess(bed, state[0]) <= limit
-
-
-def _never(params: Any, _: jax.Array, state: Any) -> jax.Array:
-    return jnp.zeros((), bool)
-
-
-def _some_sweeps(interval: int, params: Any, _: jax.Array, state: Any) -> Any:
-    bed, flow, _ = params
-    return lax.fori_loop(0, interval, lambda _, s: sweep(bed, flow, Nothing(), *s), state)
+        bound, interval = stop.count, next((n for n in range(8, 0, -1) if stop.count and stop.count % n == 0), 1)
+    else:
+        bound, interval = stop.bound, min(stop.interval, stop.bound)
+    if isinstance(scheme, Multilevel):
+        cells = start(scheme, marked)
+        sand, sweeps = descend(bed, cells, scheme, limit, tolerance, bound, interval, sand)
+    else:
+        plan = schedule(scheme, limit, bound, interval) if isinstance(scheme, SuperTimeStepping) else scheme
+        enough = None if isinstance(stop, Sweeps) else tolerance
+        sand, sweeps = march(bed, Nothing(), plan, enough, bound // interval, interval, sand)
+    u, lost = sand
+    residual = worst_excess(bed, u)
+    broken = broken | spoiled(marked, at(u)) | ~sound(bed)
+    outcome = Outcome.NOT_STILL * (residual > stop.tolerance) + Outcome.NOT_FINITE * broken
+    settled = unmark(at(u), height)
+    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), volume_lost(bed, lost))
 
 
 _settle = jax.jit(relax)
 
 
-def _chunks(scene: Scene, height: jax.Array, scheme: Relaxation, stop: Stop, *, chunk: int) -> Settled:
+def _chunks(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, *, chunk: int) -> Settled:
     return lax.map(lambda h: relax(scene, h, scheme, stop), height, batch_size=chunk)
 
 

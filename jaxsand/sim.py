@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.push import Pushed, SteppedPush, push_along
+from jaxsand.legs import Pushed
+from jaxsand.push import SteppedPush, push_along
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
+from jaxsand.schemes import Scheme
 from jaxsand.settling import (
     Outcome,
-    Relaxation,
     Settled,
     Stop,
     as_batch,
@@ -23,7 +24,11 @@ from jaxsand.settling import (
     relax,
     wide_vectors,
 )
+from jaxsand.swath import SwathPush, push_swath
 from jaxsand.tool import Pose
+
+Push = SteppedPush | SwathPush
+_PUSHES: dict[type, Any] = {SteppedPush: push_along, SwathPush: push_swath}
 
 
 @jax.tree_util.register_dataclass
@@ -34,9 +39,7 @@ class Shaped(Settled):
     pose: Pose
 
 
-def act(
-    scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike, *, push: SteppedPush | None = None
-) -> Pushed:
+def act(scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike, *, push: Push | None = None) -> Pushed:
     """What the tool does to a map [H, W] (m) along `stroke` [4] = x0, y0, x1, y1 (m), up to when it has been lifted.
 
     The map is not settled afterwards; see `step`.
@@ -50,8 +53,8 @@ def step(
     height: jax.typing.ArrayLike,
     stroke: jax.typing.ArrayLike,
     *,
-    push: SteppedPush | None = None,
-    scheme: Relaxation | None = None,
+    push: Push | None = None,
+    scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
     """One straight push on a map [H, W] (m), then settling. One map; batch with `jax.vmap` or `step_batch`.
@@ -76,8 +79,8 @@ def follow(
     height: jax.typing.ArrayLike,
     path: jax.typing.ArrayLike,
     *,
-    push: SteppedPush | None = None,
-    scheme: Relaxation | None = None,
+    push: Push | None = None,
+    scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
     """A path of legs without lifting the tool on a map [H, W] (m), then settling.
@@ -96,8 +99,8 @@ def follow_frames(
     height: jax.typing.ArrayLike,
     path: jax.typing.ArrayLike,
     *,
-    push: SteppedPush | None = None,
-    scheme: Relaxation | None = None,
+    push: Push | None = None,
+    scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> tuple[Shaped, jax.Array]:
     """`follow`, and the map after each leg, before the tool is lifted: [n - 1, H, W] (m)."""
@@ -110,8 +113,8 @@ def rollout(
     height: jax.typing.ArrayLike,
     strokes: jax.typing.ArrayLike,
     *,
-    push: SteppedPush | None = None,
-    scheme: Relaxation | None = None,
+    push: Push | None = None,
+    scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
     """Pushes one after the other: `strokes` [n, 4] (m). Every field of the result gains a leading axis of length n."""
@@ -127,8 +130,8 @@ def step_batch(
     height: jax.typing.ArrayLike,
     stroke: jax.typing.ArrayLike,
     *,
-    push: SteppedPush | None = None,
-    scheme: Relaxation | None = None,
+    push: Push | None = None,
+    scheme: Scheme | None = None,
     stop: Stop | None = None,
     chunk: int = 64,
 ) -> Shaped:
@@ -182,14 +185,14 @@ def check(result: Settled | Pushed) -> None:
     raise OutcomeError(where + "; ".join(_ADVICE[bit].format(**detail) for bit in code))
 
 
-_Rules = tuple[SteppedPush, Relaxation, Stop]
+_Rules = tuple[Push, Scheme, Stop]
 
 
 def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, _Rules]:
     push = SteppedPush() if push is None else push
-    if not isinstance(push, SteppedPush):
-        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps)")
-    if not 0 < push.substep <= 1:
+    if not isinstance(push, Push):
+        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps) or SwathPush()")
+    if isinstance(push, SteppedPush) and not 0 < push.substep <= 1:
         raise ValueError(f"push.substep: got {push.substep!r}; give a part of a spacing, above 0 and at most 1")
     check_whole("push.sweeps", push.sweeps, 0)
     check_rate(scene, "push.rate", push.rate)
@@ -221,7 +224,7 @@ def _itself(height: jax.Array) -> jax.Array:
 @partial(jax.jit, static_argnames="record")
 def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, record: Any = None) -> tuple[Shaped, Any]:
     push, scheme, stop = rules
-    pushed, frames = push_along(scene, height, path, push, record)
+    pushed, frames = _PUSHES[type(push)](scene, height, path, push, record)
     settled = relax(scene, pushed.height, scheme, stop)
     outcome = settled.outcome | pushed.outcome
     settled = replace(settled, outcome=outcome, drained=settled.drained + pushed.drained)
@@ -230,7 +233,7 @@ def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, rec
 
 @jax.jit
 def _act(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules) -> Pushed:
-    return push_along(scene, height, path, rules[0])[0]
+    return _PUSHES[type(rules[0])](scene, height, path, rules[0])[0]
 
 
 @jax.jit

@@ -50,7 +50,7 @@ def volume_error(before: jax.typing.ArrayLike, after: jax.typing.ArrayLike) -> f
     """|V1 - V0| / (dx^2 max(sum |h0|, sum |h1 - h0|)), and 0 when both sums are 0; in float64 on the host."""
     h0, h1 = np.asarray(before, np.float64), np.asarray(after, np.float64)
     moved = max(math.fsum(np.abs(h0).ravel()), math.fsum(np.abs(h1 - h0).ravel()))
-    return abs(math.fsum((h1 - h0).ravel())) / moved if moved else 0.0
+    return abs(math.fsum([*h1.ravel(), *-h0.ravel()])) / moved if moved else 0.0
 
 
 def map_goal(dig: np.ndarray, cell: int, margin: int, depth: float) -> np.ndarray:

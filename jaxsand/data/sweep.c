@@ -23,6 +23,16 @@ static float worst(const float *u, int h, int w, float drop) {
   return top;
 }
 
+// The power of two of which heights up to the map's largest hold at most 2^23.
+static float grain(const float *u, int h, int w) {
+  float top = 0;
+  for (int i = 1; i <= h; i++)
+    for (int j = 1; j <= w; j++) top = fabsf(u[AT(i, j)]) > top ? fabsf(u[AT(i, j)]) : top;
+  int exponent;
+  frexpf(top > 1e-30f ? top : 1e-30f, &exponent);
+  return ldexpf(1, exponent - 23);
+}
+
 // maps [n, h, w] are settled in place; sweeps [n] receives the number of sweeps of each. Returns 0, or 1 without memory.
 int settle(float *maps, int n, int h, int w, float spacing, float mu, float rate, float tolerance, int interval, int bound,
            int *sweeps) {
@@ -35,20 +45,15 @@ int settle(float *maps, int n, int h, int w, float spacing, float mu, float rate
   }
   float drop = mu * spacing, diagonal = drop * 1.41421356f;
   for (int t = 0; t < n; t++) {
-    float *map = maps + (size_t)t * h * w, top = 0;
+    float *map = maps + (size_t)t * h * w;
     for (int k = 0; k < (h + 2) * (w + 2); k++) a[k] = b[k] = NAN;
     for (int i = 0; i < h; i++)
-      for (int j = 0; j < w; j++) {
-        float x = map[i * w + j];
-        a[AT(i + 1, j + 1)] = x;
-        top = fabsf(x) > top ? fabsf(x) : top;
-      }
-    int exponent;
-    frexpf(top > 1e-30f ? top : 1e-30f, &exponent);
-    float quantum = ldexpf(1, exponent - 23), c = rate / quantum, d = c / 1.41421356f;
-    float limit = fmaxf(tolerance, 2 * quantum / (rate * spacing)) * spacing;
+      for (int j = 0; j < w; j++)
+        a[AT(i + 1, j + 1)] = map[i * w + j];
     int k = 0;
-    while (k < bound && (tolerance < 0 || worst(a, h, w, drop) > limit)) {
+    while (k < bound) {
+      float quantum = grain(a, h, w), c = rate / quantum, d = c / 1.41421356f;
+      if (tolerance >= 0 && worst(a, h, w, drop) <= fmaxf(tolerance, 2 * quantum / (rate * spacing)) * spacing) break;
       for (int s = 0; s < interval; s++, k++) {
         for (int i = 1; i <= h; i++)
           for (int j = 1; j <= w; j++) {

@@ -1,0 +1,175 @@
+"""The analysis of arXiv:1908.02745 once more: sweeps against flow rate and resolution, and what looking only where sand
+moves could save. And the push: its error against its run time."""
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.bed import at, halo, largest, prepare, quantum
+from jaxsand.flux import Nothing
+from jaxsand.plain import settle_numpy
+from jaxsand.push import SteppedPush
+from jaxsand.scene import make_scene
+from jaxsand.schemes import Relaxation
+from jaxsand.settling import UntilStill, relax, settle, settle_batch
+from jaxsand.sim import step_batch
+from jaxsand.swath import SwathPush
+from jaxsand.sweep import Flow, sweep
+from jaxsand.tool import Blade
+from jaxsand.workprec import COLUMN, RIDGE, distance, trench
+
+Tell = Callable[[str], None]
+_ANGLE = math.radians(29)
+_BOUND = 4000
+_RATES = (0.04, 0.06, 0.08, 0.1, 0.125, 1 / 6.83, 0.16, 0.18, 0.2, 1 / 4.83, 0.22, 0.25)
+
+
+def sweeps_against_rate(n: int = 32) -> list[dict[str, Any]]:
+    """Sweeps to stillness (slope tolerance 1e-2) of the paper's sweep at flow rates k = rate dx^2 (dx in one dimension), in
+    float64 and beyond the stable range too: None where it never comes to rest."""
+    rows = []
+    with jax.enable_x64(True):
+        for dimensions, height, rates in (
+            (1, 8 * RIDGE.heights(n), np.linspace(0.05, 0.55, 11)),
+            (
+                2,
+                4 * COLUMN.heights(n),
+                np.array([0.02, 0.04, 0.06, 0.08, 0.1, 0.125, 1 / 6.83, 0.16, 0.18, 0.2, 1 / 4.83, 0.22, 0.25]),
+            ),
+        ):
+            scene = make_scene((height.shape[0], height.shape[1]), 1.0, _ANGLE)
+            h = jnp.asarray(height, jnp.float64)
+            run = jax.jit(lambda rate, h=h, scene=scene: relax(scene, h, Relaxation(rate), UntilStill(1e-2, _BOUND, 1)))
+            for rate in rates:
+                settled = run(jnp.float64(rate))
+                still = int(settled.outcome) == 0
+                rows.append(
+                    {"dimensions": dimensions, "rate": float(rate), "sweeps": int(settled.sweeps) if still else None}
+                )
+    return rows
+
+
+def sweeps_against_resolution(sides: tuple[int, ...] = (32, 64, 96, 128, 160)) -> list[dict[str, Any]]:
+    """Sweeps of the paper's sweep at k = dx^2 / 8 for one trench on ever finer grids, for several tolerances."""
+    rows = []
+    for n in sides:
+        scene, h = make_scene((n, n), 1.0, _ANGLE), jnp.asarray(trench(n), jnp.float32)
+        row: dict[str, Any] = {"cells": n}
+        for tolerance in (0.1, 0.03, 0.01, 1e-3):
+            settled = settle(scene, h, scheme=Relaxation(), stop=UntilStill(tolerance, interval=1))
+            row[f"tolerance {tolerance:g}"] = int(settled.sweeps)
+        rows.append(row)
+    return rows
+
+
+def activity(n: int = 160, sweeps: int = 1000) -> dict[str, Any]:
+    """Cells that a sweep of the trench would have to visit: all, those in the box around what moves, those that move."""
+    scene = make_scene((n, n), 1.0, _ANGLE)
+    bed, h = prepare(scene), jnp.asarray(trench(n), jnp.float32)
+    flow = Flow(jnp.float32(0.125), quantum(largest(h)))
+
+    def one(u: jax.Array, _: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        after = sweep(bed, flow, Nothing(), u, None)[0]
+        moved = jnp.abs(at(after) - at(u)) > 1e-3 * bed.drop
+        sides = [jnp.any(moved, axis=axis) for axis in (0, 1)]
+        spans = [jnp.max(jnp.where(s, jnp.arange(n), -1)) - jnp.min(jnp.where(s, jnp.arange(n), n)) + 3 for s in sides]
+        box = jnp.where(jnp.any(moved), spans[0] * spans[1], 0)
+        return after, (box, jnp.sum(moved))
+
+    _, (boxes, cells) = jax.lax.scan(one, halo(h), None, length=sweeps)
+    busy = int(np.sum(np.asarray(cells) > 0))
+    return {
+        "cells": n,
+        "sweeps": busy,
+        "box_share": float(np.asarray(boxes, float)[:busy].mean() / n**2),
+        "moving_share": float(np.asarray(cells, float)[:busy].mean() / n**2),
+    }
+
+
+def peer(batch: int = 256, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """60 x 30 cells of 10 mm, a block of 20 x 10 cells and 40 mm, 30 degrees: the case on which an open-source sand-shaping
+    gym reports 671 iterations and 0.33 s in numpy."""
+    tell("the peer's case")
+    scene = make_scene((60, 30), 0.01, math.radians(30))
+    h = np.zeros((60, 30), np.float32)
+    h[20:40, 10:20] = 0.04
+    with jax.enable_x64(True):
+        exact = settle(scene, jnp.asarray(h, jnp.float64), scheme=Relaxation(1 / 64), stop=UntilStill(1e-6, 400_000, 64))
+        end = np.asarray(exact.height)
+    began = time.perf_counter()
+    plain, sweeps = settle_numpy(h, 0.01, math.tan(math.radians(30)))
+    seconds = time.perf_counter() - began
+    rows: list[dict[str, Any]] = [
+        {"name": "numpy, paper's sweep", "sweeps": sweeps, "seconds": seconds, "error": distance(plain, end, h)}
+    ]
+    maps = jnp.broadcast_to(jnp.asarray(h), (batch, 60, 30))
+    for name, scheme in (("settle_batch, paper's sweep", Relaxation()), ("settle_batch", None)):
+        settled = settle_batch(scene, maps, scheme=scheme)
+        best = math.inf
+        for _ in range(5):
+            began = time.perf_counter()
+            jax.block_until_ready(settle_batch(scene, maps, scheme=scheme).height)
+            best = min(best, (time.perf_counter() - began) / batch)
+        rows.append(
+            {
+                "name": name,
+                "sweeps": int(settled.sweeps[0]),
+                "seconds": best,
+                "error": distance(np.asarray(settled.height[0], float), end, h),
+            }
+        )
+    for row in rows:
+        row["times_numpy"] = seconds / row["seconds"]
+        row["times_reported"] = 0.33 / row["seconds"]
+    return rows
+
+
+def push_precision(batch: int = 64, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """Random pushes of the default blade by sub-step and sweeps: `error` is sum |h - h_ref| / sum |h_ref| after settling,
+    against sub-steps of 1/8 with 128 sweeps each."""
+    scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
+    strokes = random_strokes(batch)
+    level = jnp.zeros((batch, 32, 32), jnp.float32)
+    run = partial(step_batch, scene, level, strokes)
+    tell("reference push")
+    best = np.asarray(run(push=SteppedPush(1 / 8, 128)).height, float)
+    ways: list[SteppedPush | SwathPush] = [SteppedPush(s, n) for s in (1.0, 0.5, 0.25, 0.125) for n in (2, 8, 32)]
+    rows = []
+    for push in (*ways, SwathPush()):
+        name = f"sub-step {push.substep:g}, {push.sweeps} sweeps" if isinstance(push, SteppedPush) else "swath"
+        tell(f"push: {name}")
+        height = np.asarray(run(push=push).height, float)
+        seconds = math.inf
+        for _ in range(3):
+            began = time.perf_counter()
+            jax.block_until_ready(run(push=push).height)
+            seconds = min(seconds, time.perf_counter() - began)
+        error = np.abs(height - best).sum() / np.abs(best).sum()
+        rows.append({"name": name, "error": float(error), "pushes_per_second": batch / seconds})
+    return rows
+
+
+def push_against_spacing(tell: Tell = lambda _: None, batch: int = 16) -> list[dict[str, Any]]:
+    """The same pushes on finer grids, averaged over the cells of the coarsest, against the finest; with the fitted order."""
+    maps = {}
+    for n in (16, 32, 64, 128):
+        tell(f"push on {n} cells")
+        scene = make_scene((n, n), 0.32 / n, _ANGLE, tool=Blade(width=0.06, thickness=0.03, depth=0.02))
+        level = jnp.zeros((batch, n, n), jnp.float32)
+        h = np.asarray(step_batch(scene, level, random_strokes(batch), push=SteppedPush(0.5, 32)).height, float)
+        maps[n] = h.reshape(batch, 16, n // 16, 16, n // 16).mean((2, 4))
+    sides = (16, 32, 64)
+    errors = [float(np.abs(maps[n] - maps[128]).sum() / np.abs(maps[128]).sum()) for n in sides]
+    order = -float(np.polyfit(np.log(sides), np.log(errors), 1)[0])
+    return [{"cells": n, "error": e, "fitted_order": order} for n, e in zip(sides, errors, strict=True)]
+
+
+def random_strokes(batch: int, side: float = 0.32) -> jax.Array:
+    """Strokes between points of the middle four fifths of the map (m)."""
+    return jax.random.uniform(jax.random.key(0), (batch, 4), jnp.float32, minval=0.1 * side, maxval=0.9 * side)

@@ -1,0 +1,260 @@
+"""Where sand flows: over every link that is steeper than repose.
+
+With heights h, spacing dx and mu = tan(angle of repose), a sweep is a gradient step on a convex function of h. For 4 or 8
+neighbours that is half the sum over links of length d = l dx of the squared excess, and what cell i gains from cell j is
+
+    f_ij = excess(h_j - h_i, mu d) / l,       excess(s, m) = s - clip(s, -m, m)
+
+(Eq. 1-2 of arXiv:1908.02745). Repose then holds along eight directions and piles are octagons. Isotropic sand yields to the
+length of the gradient: with the four one-sided gradients g of a cell, one for each pair of a straight neighbour along x and
+one along y, the function is 1/4 sum max(|g| - mu, 0)^2 / 2 over all of them, and only straight links carry sand,
+
+    f_ij = (h_j - h_i) * mean of max(1 - mu / |g|, 0) over the four gradients that contain the link.
+
+It converges to the conical pile as the grid is refined. A missing neighbour (wall, edge) has no slope.
+
+Links are kept as maps, one for each direction, with one row or column more than the map has: cell j loses the very number
+that cell i gains.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxsand.bed import Bed, Rim, at, halo
+from jaxsand.grid import Link, links
+
+Fluxes = tuple[jax.Array, ...]
+NARROW = 0.05  # in an open share below this sand stands no higher than it would in this one
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Nothing:
+    """No tool stands in the sand and every cell is whole (neutral)."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Around:
+    """A tool standing in the sand; see `stand`.
+
+    A cell of mean height h above the tool's bottom b holds that sand in its open share, where it stands at
+    h + stretch (h - b), stretch = cover / open (in a sliver less, so that the flow out of it ends as it closes). A link is
+    as open as the less open of its two cells, which keeps a sweep stable for any cover.
+    """
+
+    open: jax.Array  # [H + 2, W + 2]
+    stretch: jax.Array  # [H, W]
+    bottom: jax.Array  # m, []
+
+    def surface(self, height: jax.Array) -> jax.Array:
+        return height + self.stretch * jnp.where(height > self.bottom, height - self.bottom, 0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Partial:
+    """Cells of which only a share, `open` [H + 2, W + 2], can hold sand: a map [H, W] of volume per cell area."""
+
+    open: jax.Array
+
+    def surface(self, volume: jax.Array) -> jax.Array:
+        share = at(self.open)
+        return volume / jnp.where(share > 0, share, 1)
+
+
+def stand(cover: jax.Array, bottom: jax.Array) -> Around:
+    """A tool with its bottom at height `bottom` (m) that covers the share `cover` [H, W] of each cell."""
+    free = 1 - cover
+    return Around(halo(free, 0.0), cover / jnp.maximum(free, NARROW), bottom)
+
+
+def fluxes(bed: Bed, around: Nothing | Around | Partial, u: jax.Array) -> Fluxes:
+    """What flows over every link of a map with halo at rate 1 (m), towards its first cell; last what drains, if it does."""
+    s, gate = (u, None) if isinstance(around, Nothing) else (halo(around.surface(at(u))), around.open)
+    flow = _isotropic(bed, gate, s) if bed.neighbours == "isotropic" else _pairwise(bed, gate, s)
+    if bed.rim is not None:
+        out = _over(bed, bed.rim, at(s)) * _draining_sides(bed.rim)
+        flow = (*flow, out if gate is None else out * at(gate))
+    return flow
+
+
+def gained(bed: Bed, flow: Fluxes) -> jax.Array:
+    """What each cell [H, W] gains from the fluxes over its links."""
+    net = jnp.zeros((), flow[0].dtype)
+    for (di, dj, _), f in zip(links(bed.neighbours), flow, strict=False):
+        rows, columns = f.shape
+        right, left = f[:, max(dj, 0) : columns + min(dj, 0)], f[:, max(-dj, 0) : columns - max(dj, 0)]
+        net = net + (right[di:] - left[: rows - di])
+    return net if bed.rim is None else net - flow[-1]
+
+
+def fluxes_zero(bed: Bed, u: jax.Array) -> Fluxes:
+    """No flux over any link of a map with halo."""
+    maps = [jnp.zeros_like(ends(u, di, dj)[0]) for di, dj, _ in links(bed.neighbours)]
+    return (*maps, jnp.zeros_like(at(u))) if bed.rim is not None else tuple(maps)
+
+
+def worst_excess(bed: Bed, u: jax.Array, around: Nothing | Partial | None = None) -> jax.Array:
+    """The largest slope in excess of repose (a tangent) of a map with halo; 0 when it is still.
+
+    In partial cells an excess counts as far as it drives sand: where flows end, it is 0.
+    """
+    gate = None
+    if isinstance(around, Partial):
+        u, gate = halo(around.surface(at(u))), around.open
+    worst = jnp.zeros((), u.dtype)
+    for e in _excesses(bed, gate, u):
+        worst = jnp.maximum(worst, jnp.max(jnp.max(jnp.where(e > 0, e, 0), axis=0)))  # NaN means no link
+    if bed.rim is not None:
+        worst = jnp.maximum(worst, jnp.max(2 * _over(bed, bed.rim, at(u)) * (_draining_sides(bed.rim) > 0)))
+    return worst / bed.spacing
+
+
+def steepest(bed: Bed, u: jax.Array) -> jax.Array:
+    """The steepest slope (a tangent) of a map with halo, as its neighbourhood measures slopes."""
+    steep = [jnp.max(jnp.where(slope > 0, slope, 0)) for slope, _ in _slopes(bed, u)]
+    return jnp.max(jnp.stack(steep)) / bed.spacing
+
+
+def ends(u: jax.Array, di: int, dj: int) -> tuple[jax.Array, jax.Array]:
+    """The first and the second cell of every link in the direction (di, dj) of a map with halo."""
+    if di == 0:
+        return u[1:-1, :-1], u[1:-1, 1:]
+    if dj == 0:
+        return u[:-1, 1:-1], u[1:, 1:-1]
+    return (u[:-1, :-1], u[1:, 1:]) if dj > 0 else (u[:-1, 1:], u[1:, :-1])
+
+
+def _pairwise(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
+    return tuple(link_flux(bed, gate, s, link) for link in links(bed.neighbours))
+
+
+def link_flux(bed: Bed, gate: jax.Array | None, s: jax.Array, link: Link) -> jax.Array:
+    """excess / l over every link in one direction."""
+    di, dj, length = link
+    here, there = ends(s, di, dj)
+    d, m = there - here, _yield(bed, link)
+    e = jnp.where(d > m, d - m, 0) + jnp.where(d < -m, d + m, 0)
+    if length != 1:
+        e = e * (1 / length)
+    return e if gate is None else e * jnp.minimum(*ends(gate, di, dj))
+
+
+def _slopes(bed: Bed, u: jax.Array) -> Iterator[tuple[jax.Array, jax.Array]]:
+    """Slopes and the largest stable ones, times the spacing."""
+    if bed.neighbours != "isotropic":
+        for link in links(bed.neighbours):
+            here, there = ends(u, *link[:2])
+            yield jnp.abs(there - here) * (1 / link[2]), _yield(bed, link) * (1 / link[2])
+        return
+    x, y = _steps(u)
+    for gx, gy, m in _triangles(bed, x / bed.spacing, y / bed.spacing):
+        yield jnp.sqrt(gx * gx + gy * gy) * bed.spacing, m * bed.spacing
+
+
+def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Array]:
+    """Slopes less the largest stable ones, times the spacing; behind a gate no more than the flow that they drive."""
+    if gate is None:
+        yield from (slope - level for slope, level in _slopes(bed, u))
+    elif bed.neighbours != "isotropic":
+        for (slope, level), link in zip(_slopes(bed, u), links(bed.neighbours), strict=True):
+            yield (slope - level) * jnp.minimum(*ends(gate, *link[:2]))
+    else:
+        x, y = _steps(u)
+        for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
+            along_x = jnp.abs(gx) * ox * _yielding(gx * gx + oy * gy * gy, m)
+            along_y = jnp.abs(gy) * oy * _yielding(ox * gx * gx + gy * gy, m)
+            e = jnp.sqrt(gx * gx + gy * gy) - m  # in whole cells at most sqrt(2) times the larger
+            yield jnp.minimum(e, math.sqrt(2) * jnp.maximum(along_x, along_y)) * bed.spacing
+
+
+def _arms(gate: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+    """How open the two arms of each of the four gradients are; see `_triangles`."""
+    x, y = (jnp.minimum(*ends(gate, di, dj)) for di, dj, _ in links(4))
+    return [(_ends_x(x)[i], _ends_y(y)[j]) for i in (0, 1) for j in (0, 1)]
+
+
+def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
+    x, y = _steps(s)
+    weights = []
+    if gate is None:
+        for gx, gy, m in _triangles(bed, x / bed.spacing, y / bed.spacing):
+            w = _yielding(gx * gx + gy * gy, m)
+            weights.append((w, w))
+        opening = None
+    else:  # a gradient feels its other arm as far as that arm is open
+        opening = tuple(jnp.minimum(*ends(gate, di, dj)) for di, dj, _ in links(4))
+        for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
+            weights.append((_yielding(gx * gx + oy * gy * gy, m), _yielding(ox * gx * gx + gy * gy, m)))
+    (ww, sw), (wn, nw), (es, se), (en, ne) = weights  # by the arm along x (west, east), then along y (south, north)
+    west, east, south, north = lax.optimization_barrier((ww + wn, es + en, sw + se, nw + ne))
+    column, row = jnp.zeros_like(west[:, :1]), jnp.zeros_like(west[:1])
+    over_x = x * ((lax.concatenate([column, east], 1) + lax.concatenate([west, column], 1)) / 4)
+    over_y = y * ((lax.concatenate([row, north], 0) + lax.concatenate([south, row], 0)) / 4)
+    return (over_x, over_y) if opening is None else (over_x * opening[0], over_y * opening[1])
+
+
+def _yielding(square: jax.Array, m: jax.Array) -> jax.Array:
+    """max(1 - m / |g|, 0)."""
+    steep = square > m * m
+    return jnp.where(steep, 1 - m / jnp.sqrt(jnp.where(steep, square, 1)), 0)
+
+
+def _steps(u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Differences over the straight links, 0 where one end holds no sand: [H, W + 1] and [H + 1, W]."""
+    steps = []
+    for di, dj, _ in links(4):
+        here, there = ends(u, di, dj)
+        d = there - here
+        steps.append(jnp.where(jnp.isnan(d), 0, d))
+    return steps[0], steps[1]
+
+
+def _ends_x(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return x[:, :-1], x[:, 1:]
+
+
+def _ends_y(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return y[:-1], y[1:]
+
+
+def _triangles(bed: Bed, x: jax.Array, y: jax.Array) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
+    """The four one-sided gradients of every cell, west-south, west-north, east-south, east-north, and where each yields."""
+    mu = bed.drop / bed.spacing
+    if mu.ndim:
+        hx, hy = (jnp.add(*ends(halo(mu), di, dj)) / 2 for di, dj, _ in links(4))
+    for i in (0, 1):
+        for j in (0, 1):
+            if mu.ndim:  # the mean of its two links, or the one there is
+                mx, my = _ends_x(hx)[i], _ends_y(hy)[j]
+                m = (jnp.where(jnp.isnan(mx), my, mx) + jnp.where(jnp.isnan(my), mx, my)) / 2
+            else:
+                m = mu
+            yield _ends_x(x)[i], _ends_y(y)[j], m
+
+
+def _yield(bed: Bed, link: Link) -> jax.Array:
+    """The largest stable step over every link in one direction."""
+    di, dj, length = link
+    if not bed.drop.ndim:
+        return bed.drop * length
+    here, there = ends(halo(bed.drop, 0.0), di, dj)
+    return (here + there) * (length / 2)
+
+
+def _draining_sides(rim: Rim) -> jax.Array:
+    """How many sides of each cell drain, 0 to 4."""
+    beyond = rim.beyond
+    return at(beyond, 1, 0) + at(beyond, -1, 0) + at(beyond, 0, 1) + at(beyond, 0, -1)
+
+
+def _over(bed: Bed, rim: Rim, h: jax.Array) -> jax.Array:
+    """Height in excess of repose against the rim, half a spacing away."""
+    top = rim.level + bed.drop / 2
+    return jnp.where(h > top, h - top, 0)

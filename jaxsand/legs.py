@@ -1,0 +1,135 @@
+"""A tool's way along a path of legs, whatever it does to the sand on each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxsand.bed import Lost, halo, largest, mark, nothing_lost, prepare, quantum, sound, spoiled, unmark, volume_lost
+from jaxsand.displace import Job
+from jaxsand.flux import worst_excess
+from jaxsand.grid import centres
+from jaxsand.scene import Scene
+from jaxsand.settling import Outcome
+from jaxsand.sweep import Flow
+from jaxsand.tool import NoTool, Pose, local
+from jaxsand.window import Window
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Pushed:
+    """A map [H, W] (m) after the tool was lifted and before it settles, the `outcome` (bits of `Outcome`), the volume that
+    `drained` over the map's edge (m^3), and the tool's last `pose`."""
+
+    height: jax.Array
+    outcome: jax.Array
+    drained: jax.Array
+    pose: Pose
+
+
+State = tuple[jax.Array, Lost, jax.Array]  # height, height lost over the rim, movement at the window's edge
+Leg = Callable[[Job, Pose, jax.Array, Pose | None, State], State]
+
+
+def along_legs(
+    scene: Scene,
+    height: jax.Array,
+    path: jax.Array,
+    rate: jax.Array | float,
+    leg: Leg,
+    record: Callable[[jax.Array], Any] | None = None,
+) -> tuple[Pushed, Any]:
+    """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it.
+
+    `leg(job, pose, length, before, state)` moves it from `pose` by `length`; `before` is the pose that the tool has there
+    already, None when it is yet to be lowered. Also returns what `record(height)` gave after each leg, stacked. Without a
+    tool the map stays as it is.
+    """
+    # Beyond this the floats cannot tell on which side of the map a point lies.
+    farthest = scene.grid.spacing * 2.0 ** (jnp.finfo(path.dtype).nmant + 8)
+    usable = jnp.all(jnp.abs(path) < farthest)
+    for leaf in jax.tree.leaves(scene.tool):
+        usable = usable & jnp.all(jnp.isfinite(leaf))
+    path = jnp.where(usable, path, 0)
+    if isinstance(scene.tool, NoTool):
+        still = Pose(path[-1, 0], path[-1, 1], jnp.ones_like(path[0, 0]), jnp.zeros_like(path[0, 0]))
+        legs = path.shape[0] - 1
+        frames = jax.tree.map(lambda f: jnp.broadcast_to(f, (legs, *f.shape)), record(height)) if record else ()
+        return Pushed(height, _outcome(jnp.zeros((), bool), ~usable), jnp.zeros_like(path[0, 0]), still), frames
+    bed = prepare(scene)
+    intact, broken = mark(scene, height)
+    # Of a path or a tool that is not finite nothing is used; the blade hangs above everything.
+    tool = jax.tree.map(lambda leaf: jnp.where(usable, leaf, bed.spacing), scene.tool)
+    bottom = jnp.where(usable, -jnp.asarray(scene.tool.depth), jnp.inf)
+    scale = 4 * (largest(intact) + jnp.where(usable, jnp.abs(bottom), 0))
+    flow = Flow(jnp.asarray(rate), quantum(scale))
+    job = Job(bed, *centres(scene.grid, height.dtype), tool, bottom, flow)
+    lost = nothing_lost(bed, height)
+    moved = jnp.zeros_like(bottom)
+    if isinstance(scene.window, Window):
+        moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
+    state: State = (intact, lost, moved)
+
+    pose, length = _heading(path[0], path[1], None)
+    state = leg(job, pose, length, None, state)
+    frames = [record(unmark(state[0], height))] if record else []
+
+    def later_leg(carry: Any, ends: Any) -> tuple[Any, Any]:
+        before, state = carry
+        pose, length = _heading(ends[0], ends[1], before)
+        state = leg(job, pose, length, Pose(pose.x, pose.y, before.cos, before.sin), state)
+        return (pose, state), record(unmark(state[0], height)) if record else ()
+
+    if path.shape[0] > 2:
+        (pose, state), rest = lax.scan(later_leg, (pose, state), (path[1:-1], path[2:]))
+        if record:
+            frames = jax.tree.map(lambda first, more: jnp.concatenate([first[None], more]), frames[0], rest)
+    elif record:
+        frames = jax.tree.map(lambda first: first[None], frames[0])
+    marked, lost, moved = state
+    edge = jnp.zeros((), bool)
+    if isinstance(scene.window, Window):
+        edge = moved > scene.window.tolerance
+    drained = volume_lost(bed, lost)
+    end = Pose(path[-1, 0], path[-1, 1], pose.cos, pose.sin)
+    broken = broken | spoiled(intact, marked) | ~sound(bed) | ~usable
+    return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames
+
+
+def over_the_map(scene: Scene, job: Job, pose: Pose, length: jax.Array) -> tuple[Pose, jax.Array]:
+    """The part of a leg on which the blade touches the map: the pose where it starts, and its length."""
+    dx = job.bed.spacing
+    along = corners(scene, job, pose)
+    reach = job.tool.thickness / 2 + dx
+    first = jnp.clip(along[0] - reach, 0, length)
+    last = jnp.clip(along[1] + reach, first, length)
+    return Pose(pose.x + first * pose.cos, pose.y + first * pose.sin, pose.cos, pose.sin), last - first
+
+
+def corners(scene: Scene, job: Job, pose: Pose) -> tuple[jax.Array, jax.Array]:
+    """How far along a heading the map begins and ends (m)."""
+    rows, columns = scene.grid.shape
+    dx = job.bed.spacing
+    along = [local(pose, x * dx, y * dx)[0] for x in (0, columns) for y in (0, rows)]
+    least = jnp.minimum(jnp.minimum(*along[:2]), jnp.minimum(*along[2:]))
+    return least, jnp.maximum(jnp.maximum(*along[:2]), jnp.maximum(*along[2:]))
+
+
+def _outcome(window_edge: jax.Array, not_finite: jax.Array) -> jax.Array:
+    return (Outcome.WINDOW_EDGE * window_edge + Outcome.NOT_FINITE * not_finite).astype(jnp.int32)
+
+
+def _heading(start: jax.Array, stop: jax.Array, before: Pose | None) -> tuple[Pose, jax.Array]:
+    """The pose at the start of a leg and the leg's length. A leg of no length keeps the heading; the first one faces +x."""
+    run = stop - start
+    size = lax.stop_gradient(jnp.max(jnp.abs(run)))  # squares of far strokes would overflow
+    moving = size > 0
+    part = jnp.where(moving, run / jnp.where(moving, size, 1), 1)
+    length = jnp.where(moving, size * jnp.sqrt(jnp.sum(part**2)), 0)
+    unit = run / jnp.where(moving, length, 1)
+    cos, sin = (before.cos, before.sin) if before else (jnp.ones_like(length), jnp.zeros_like(length))
+    return Pose(start[0], start[1], jnp.where(moving, unit[0], cos), jnp.where(moving, unit[1], sin)), length

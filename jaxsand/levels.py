@@ -1,0 +1,122 @@
+"""Coarse-to-fine settling: see `Multilevel`. On every grid a map is volume per cell area, which whole quanta keep exact."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxsand.bed import Bed, at, halo, largest, nothing_lost, quantum, rim_of, truncate
+from jaxsand.flux import Nothing, Partial
+from jaxsand.march import Sand, march, still
+from jaxsand.schemes import Multilevel, schedule
+
+Cells = Nothing | Partial
+
+
+def descend(
+    bed: Bed,
+    cells: Cells,
+    scheme: Multilevel,
+    limit: float,
+    tolerance: jax.Array,
+    bound: int,
+    interval: int,
+    sand: Sand,
+    level: int = 0,
+) -> tuple[Sand, jax.Array]:
+    """Settles on this grid and the coarser ones: the sand, and the sweeps in units of this grid's."""
+    rows, columns = (n - 2 for n in sand[0].shape)
+    early = schedule(scheme.steps(), limit, bound, interval, scheme.handover / 4 if level else 0.0)
+    narrow = max(rows, columns) if 1 in (rows, columns) else min(rows, columns)
+    if narrow < 2 * scheme.coarsest:
+        return march(bed, cells, early, tolerance, bound // interval, interval, sand)
+    # To the first end of a group past the handover that is also the end of a step.
+    ends = early.starts[(early.times >= scheme.handover) & (early.starts % interval == 0)]
+    groups = int(ends[0]) // interval if ends.size else bound // interval
+    sand, taken = march(bed, cells, early, tolerance, groups, interval, sand)
+
+    grain = quantum(largest(at(sand[0])))
+    wide_bed, wide_cells, wide = _widen(bed, cells, grain, at(sand[0]))
+    begun = (halo(wide), nothing_lost(wide_bed, wide))
+    (ended, lost), more = descend(wide_bed, wide_cells, scheme, limit, tolerance, bound, interval, begun, level + 1)
+    early_end = still(bed, cells, (tolerance, 2 / (scheme.safety * limit * bed.spacing)), sand[0])
+    change = jnp.where(jnp.isnan(wide) | early_end, 0, at(ended) - wide)
+    u, gone = sand
+    u = halo(at(u) + _spread(cells, grain, change, at(u)))
+    if gone is not None and lost is not None:
+        gone = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), gone, lost)
+    late = schedule(scheme.steps(), limit, bound, interval)
+    sand, again = march(bed, cells, late, tolerance, bound // interval, interval, (u, gone))
+    return sand, taken + again + jnp.where(early_end, 0, (more + 3) // 4)
+
+
+def _widen(bed: Bed, cells: Cells, grain: jax.Array, volume: jax.Array) -> tuple[Bed, Cells, jax.Array]:
+    """The bed, the cells and the volume [H/2, W/2] of the next coarser grid."""
+    wide = _sum(_quarters(volume)) / 4  # NaN where any of the four is: no sand passes through a wall
+    wide_cells: Cells = cells
+    if isinstance(cells, Partial):
+        wide_cells = Partial(halo(_sum(_quarters(at(cells.open))) / 4, 0.0))
+    wide = truncate(wide / grain) * grain
+    drop = bed.drop * 2
+    if bed.drop.ndim:
+        rows, columns = bed.drop.shape
+        drop = _sum(_quarters(jnp.pad(bed.drop, ((0, rows % 2), (0, columns % 2)), mode="edge"))) / 2
+    rim = None if bed.rim is None else rim_of(wide.shape, bed.rim.level)
+    return replace(bed, spacing=bed.spacing * 2, drop=drop, rim=rim), wide_cells, wide
+
+
+def _sum(parts: list[jax.Array]) -> jax.Array:
+    return parts[0] + parts[1] + parts[2] + parts[3]
+
+
+def _quarters(x: jax.Array) -> list[jax.Array]:
+    """The four cells of each coarse one; beyond an odd edge there is nothing."""
+    x = jnp.pad(x, ((0, x.shape[0] % 2), (0, x.shape[1] % 2)))
+    return [x[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+
+
+def _inject(x: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    return jnp.repeat(jnp.repeat(x, 2, 0), 2, 1)[: shape[0], : shape[1]]
+
+
+def _spread(cells: Cells, grain: jax.Array, change: jax.Array, volume: jax.Array) -> jax.Array:
+    """A change of coarse cells for the fine ones: in whole quanta of the same sum, linear where cells are whole."""
+    rows, columns = volume.shape
+    whole_cell = ~jnp.isnan(volume)
+    if isinstance(cells, Nothing):
+        fine = _inject(change, volume.shape)
+    else:
+        parts = _quarters(at(cells.open))
+        total = _sum(parts)
+        given = [truncate(4 * change * (p / total) / grain) * grain for p in parts]
+        rest, found = 4 * change - _sum(given), jnp.zeros(total.shape, bool)
+        fullest = jnp.max(jnp.stack(parts), axis=0)
+        for k, p in enumerate(parts):  # what rounding left over goes to the first of the fullest
+            chosen = (p == fullest) & ~found
+            given[k] = given[k] + jnp.where(chosen, rest, 0)
+            found = found | chosen
+        fine = jnp.zeros((2 * total.shape[0], 2 * total.shape[1]), change.dtype)
+        for k, g in enumerate(given):
+            fine = fine.at[k // 2 :: 2, k % 2 :: 2].set(g)
+        fine, whole_cell = fine[:rows, :columns], whole_cell & (at(cells.open) == 1)
+    for axis in (0, 1):  # pairs across a coarse cell's border exchange a quarter of their difference
+        a, b = (lax.slice_in_dim(fine, i, fine.shape[axis] - 1 + i, axis=axis) for i in (0, 1))
+        ok = lax.slice_in_dim(whole_cell, 0, fine.shape[axis] - 1, axis=axis)
+        ok = ok & lax.slice_in_dim(whole_cell, 1, fine.shape[axis], axis=axis)
+        odd = np.arange(fine.shape[axis] - 1) % 2 == 1
+        over = jnp.where(ok & (odd[:, None] if axis == 0 else odd[None, :]), truncate((b - a) / (4 * grain)) * grain, 0)
+        nothing = jnp.zeros_like(lax.slice_in_dim(fine, 0, 1, axis=axis))
+        fine = fine + lax.concatenate([over, nothing], axis) - lax.concatenate([nothing, over], axis)
+    return fine
+
+
+def start(scheme: Multilevel, marked: jax.Array) -> Cells:
+    """The cells of the finest grid: Nothing special where every cell of every grid is made of four."""
+    rows, columns = marked.shape
+    odd = 1 in marked.shape
+    while min(rows, columns) >= 2 * scheme.coarsest:
+        odd = odd or rows % 2 == 1 or columns % 2 == 1
+        rows, columns = rows // 2, columns // 2
+    return Partial(halo(jnp.ones_like(marked), 0.0)) if odd else Nothing()

@@ -1,0 +1,123 @@
+"""How a scheme marches: groups of sweeps until the map is still, on one grid."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxsand.bed import Bed, Lost, at, largest, quantum, truncate
+from jaxsand.flux import Fluxes, Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.grid import links
+from jaxsand.loop import repeat_until
+from jaxsand.schemes import Pairwise, Relaxation, Schedule
+from jaxsand.sweep import Flow, apply, surge, sweep
+
+Sand = tuple[jax.Array, Lost]  # a map with halo, and what it lost over the rim
+
+
+def march(
+    bed: Bed,
+    around: Nothing | Partial,
+    scheme: Relaxation | Pairwise | Schedule,
+    tolerance: jax.Array | None,
+    groups: int,
+    interval: int,
+    sand: Sand,
+) -> tuple[Sand, jax.Array]:
+    """Sweeps in groups of `interval` until no slope exceeds repose by more than the tolerance (None: to the last group), at
+    most `groups` of them: the sand and the number of sweeps.
+
+    The quantum follows the largest height down, so that a spike leaves sand as smooth as its remains allow.
+    """
+    state: Any = sand
+    body: Any
+    done: Any
+    if isinstance(scheme, Schedule):
+        state = (*sand, fluxes_zero(bed, sand[0]))
+        body = partial(_steps, scheme, interval)
+        rate: Any = float(scheme.rates[-1])
+        done = partial(_still_after_a_step, scheme, interval)
+        params: Any = (bed, around, tolerance)
+    else:
+        body = partial(_pairs if isinstance(scheme, Pairwise) else _sweeps, interval)
+        rate = scheme.share / 2 if isinstance(scheme, Pairwise) else scheme.rate
+        done = _still
+        params = (bed, around, tolerance, rate)
+    if tolerance is None:
+        done = _never
+    else:  # below this slope every flux is cut to nothing
+        quanta = 4 if isinstance(scheme, Pairwise) and bed.rim is not None else 2
+        floor = lax.stop_gradient(quanta / (rate * bed.spacing))
+        params = (*params[:2], (tolerance, floor), *params[3:])
+    state, taken = repeat_until(done, body, groups, params, state)
+    return (state[0], state[1]), taken * interval
+
+
+def still(bed: Bed, around: Nothing | Partial, limits: tuple[jax.Array, jax.Array], u: jax.Array) -> jax.Array:
+    """Whether no slope exceeds repose by more than the tolerance, or than the floats can move."""
+    tolerance, floor = limits
+    if bed.neighbours == "isotropic":  # the larger part of a gradient moves at least 1/(4 sqrt(2)) of its excess
+        floor = 3 * floor
+    return worst_excess(bed, u, around) <= jnp.maximum(tolerance, floor * quantum(largest(at(u))))
+
+
+def _never(params: Any, k: jax.Array, state: Any) -> jax.Array:
+    return jnp.zeros((), bool)
+
+
+def _still(params: Any, k: jax.Array, state: Any) -> jax.Array:
+    bed, around, limits = params[:3]
+    return still(bed, around, limits, state[0])
+
+
+def _still_after_a_step(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any) -> jax.Array:
+    return jnp.any(jnp.asarray(plan.starts) == k * interval) & _still(params, k, state)
+
+
+def _sweeps(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
+    bed, around, _, rate = params
+    flow = Flow(jnp.asarray(rate), quantum(largest(at(state[0]))))
+    return lax.fori_loop(0, interval, lambda _, s: sweep(bed, flow, around, *s), state)
+
+
+def _steps(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any) -> Any:
+    bed, around, _ = params
+    dtype = state[0].dtype
+    grain = quantum(largest(at(state[0])))
+    starts, rates = jnp.asarray(plan.starts), jnp.asarray(plan.rates, dtype)
+
+    def stage(i: jax.Array, s: tuple[jax.Array, Lost, Fluxes]) -> tuple[jax.Array, Lost, Fluxes]:
+        n = k * interval + i
+        step = jnp.sum(starts <= n) - 1
+        before = (n - starts[step]).astype(dtype)  # stages of this step already taken
+        flow = Flow(rates[step] * (2 - 1 / (before + 1)), grain)
+        return surge(bed, flow, before / (before + 1), around, s)
+
+    u, lost, last = state
+    u, lost, last = lax.fori_loop(0, interval, stage, (u, lost, tuple(m / grain for m in last)))
+    return u, lost, tuple(m * grain for m in last)
+
+
+def _pairs(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
+    bed, _, _, half = params
+    flow = Flow(jnp.asarray(half), quantum(largest(at(state[0]))))
+    return lax.fori_loop(0, interval, lambda _, s: _each_pair(bed, flow, *s), state)
+
+
+def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
+    scale = flow.rate / flow.quantum
+    for chosen, link in enumerate(links(bed.neighbours)):
+        for colour in (0, 1):
+            excess = link_flux(bed, None, u, link) * link[2]
+            rows, columns = excess.shape
+            turn = (np.arange(rows)[:, None] if link[0] else np.arange(columns)[None, :]) % 2 == colour
+            moved = list(fluxes_zero(bed, u))
+            moved[chosen] = lax.optimization_barrier(jnp.where(turn, truncate(excess * scale), 0))
+            u, lost = apply(bed, flow, tuple(moved), u, lost)
+    if bed.rim is None:
+        return u, lost
+    drain = truncate(fluxes(bed, Nothing(), u)[-1] * (scale / 2))  # a cell has up to four sides
+    return apply(bed, flow, (*fluxes_zero(bed, u)[:-1], drain), u, lost)
