@@ -15,9 +15,10 @@ from jaxsand.bed import at, halo, largest, prepare, quantum
 from jaxsand.flux import Nothing
 from jaxsand.plain import settle_numpy
 from jaxsand.push import SteppedPush
+from jaxsand.rules import UntilStill
 from jaxsand.scene import make_scene
 from jaxsand.schemes import Relaxation
-from jaxsand.settling import UntilStill, relax, settle, settle_batch
+from jaxsand.settling import relax, settle, settle_batch
 from jaxsand.sim import step_batch
 from jaxsand.swath import SwathPush
 from jaxsand.sweep import Flow, sweep

@@ -27,6 +27,7 @@ class Bed:
     spacing: jax.Array  # m, []
     drop: jax.Array  # the largest stable step between straight neighbours, mu dx: [] or [H, W]
     rim: "Rim | None"
+    elsewhere: jax.Array  # the largest height outside, where the bed is a block of a map (m), []
     neighbours: Neighbours = field(metadata={"static": True})
 
 
@@ -44,7 +45,7 @@ def prepare(scene: Scene) -> Bed:
     dx = jnp.asarray(scene.grid.spacing)
     drop = jnp.tan(jnp.asarray(scene.material.repose_angle)) * dx
     rim = rim_of(scene.grid.shape, jnp.asarray(scene.edge.level)) if isinstance(scene.edge, Draining) else None
-    return Bed(dx, drop, rim, scene.grid.neighbours)
+    return Bed(dx, drop, rim, jnp.zeros_like(dx), scene.grid.neighbours)
 
 
 def rim_of(shape: tuple[int, ...], level: jax.Array) -> Rim:
@@ -79,7 +80,7 @@ def sound(bed: Bed) -> jax.Array:
 def largest(height: jax.Array) -> jax.Array:
     """The largest |height| where there is sand."""
     size = jnp.abs(height)
-    return jnp.max(jnp.where(size > 0, size, 0))
+    return jnp.max(jnp.max(jnp.where(size > 0, size, 0), axis=0))  # rows first: XLA vectorises that
 
 
 def quantum(scale: jax.Array) -> jax.Array:
@@ -88,6 +89,11 @@ def quantum(scale: jax.Array) -> jax.Array:
     scale = jnp.maximum(lax.stop_gradient(scale), float(info.tiny) * 2.0**info.nmant)
     _, exponent = jnp.frexp(scale)
     return jnp.ldexp(jnp.ones_like(scale), exponent - info.nmant)
+
+
+def grain(bed: Bed, u: jax.Array) -> jax.Array:
+    """The quantum for a map with halo."""
+    return quantum(jnp.maximum(largest(u), bed.elsewhere))
 
 
 @jax.custom_jvp

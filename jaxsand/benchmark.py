@@ -21,12 +21,14 @@ import numpy as np
 
 from jaxsand import analysis, goals, stability, workprec
 from jaxsand.analysis import random_strokes
+from jaxsand.batch import cores
 from jaxsand.files import as_table
 from jaxsand.plain import compile_c, settle_numpy
 from jaxsand.push import SteppedPush
+from jaxsand.rules import Sweeps, UntilStill
 from jaxsand.scene import Scene, make_scene
 from jaxsand.schemes import Relaxation, SuperTimeStepping
-from jaxsand.settling import Settled, Sweeps, UntilStill, settle, settle_batch
+from jaxsand.settling import Settled, settle, settle_batch
 from jaxsand.shaping import Layout, glyph_target, map_target, shape
 from jaxsand.sim import act, step, step_batch
 from jaxsand.swath import SwathPush
@@ -89,7 +91,7 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
     scene, heights = _pushed(batch)
     host = np.asarray(heights)
     sample = min(sample, batch)
-    cores = _cores()
+    count = cores()
     mu = math.tan(_ANGLE)
     vmapped = jax.jit(jax.vmap(partial(settle, scene)))
 
@@ -101,16 +103,16 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
         return np.array(sweeps), np.stack(maps)
 
     ways = {
-        "settle_batch": Way(lambda: ours(settle_batch(scene, heights)), batch, cores),
-        "settle_batch, tolerance 1e-2": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, cores),
+        "settle_batch": Way(lambda: ours(settle_batch(scene, heights)), batch, count),
+        "settle_batch, tolerance 1e-2": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, count),
         "settle_batch, growth 0.8": Way(
-            lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8))), batch, cores
+            lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8))), batch, count
         ),
-        "settle_batch, paper's sweep": Way(lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, cores),
+        "settle_batch, paper's sweep": Way(lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, count),
         f"settle_batch, {fixed} of the paper's sweeps": Way(
-            lambda: ours(settle_batch(scene, heights, scheme=Relaxation(), stop=Sweeps(fixed))), batch, cores
+            lambda: ours(settle_batch(scene, heights, scheme=Relaxation(), stop=Sweeps(fixed))), batch, count
         ),
-        "vmap(settle)": Way(lambda: ours(vmapped(heights)), batch, cores),
+        "vmap(settle)": Way(lambda: ours(vmapped(heights)), batch, count),
         _NUMPY: Way(plain, sample),
     }
     settle_c = compile_c()
@@ -125,8 +127,8 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
 
         ways[_C] = Way(lambda: threads(1), batch)
         ways[f"C loop, {fixed} sweeps"] = Way(lambda: threads(1, tolerance=-1.0, bound=fixed), batch)
-        if cores > 1:
-            ways[f"C loop, {cores} cores"] = Way(lambda: threads(cores), batch, cores)
+        if count > 1:
+            ways[f"C loop, {count} cores"] = Way(lambda: threads(count), batch, count)
     small = partial(settle_numpy, rate=1 / 64, tolerance=1e-6)
     limit = np.stack([small(h.astype(float), _SPACING, mu)[0] for h in host[:sample]])
     largest = np.abs(limit - host[:sample]).max()
@@ -165,7 +167,7 @@ def bench_push(batch: int, tell: Tell = lambda _: None, sample: int = 64) -> lis
     few = min(16, sample)
 
     def batched(sand: Scene, push: SteppedPush | SwathPush | None = None) -> Way:
-        return Way(lambda: (None, step_batch(sand, level, strokes, push=push).height[:sample]), batch, _cores())
+        return Way(lambda: (None, step_batch(sand, level, strokes, push=push).height[:sample]), batch, cores())
 
     ways = {
         "step_batch": batched(scene),
@@ -175,7 +177,7 @@ def bench_push(batch: int, tell: Tell = lambda _: None, sample: int = 64) -> lis
         "step_batch, sub-step 1": batched(scene, SteppedPush(1.0, 8)),
         "step_batch, window 16 x 16": batched(near),
         "step_batch, swath": batched(scene, SwathPush()),
-        "vmap(step)": Way(lambda: (None, vmapped(level, strokes).height[:sample]), batch, _cores()),
+        "vmap(step)": Way(lambda: (None, vmapped(level, strokes).height[:sample]), batch, cores()),
         "step, one map at a time": Way(lambda: (None, jnp.stack([alone(level[0], s).height for s in strokes[:few]])), few),
     }
     best = np.asarray(step_batch(scene, level[:sample], strokes[:sample], push=SteppedPush(0.25, 64)).height, float)
@@ -265,12 +267,6 @@ def _pushed(batch: int) -> tuple[Scene, jax.Array]:
         random_strokes(batch)
     )
     return make_scene((_CELLS, _CELLS), _SPACING, _ANGLE), jax.block_until_ready(pushed)
-
-
-def _cores() -> int:
-    if jax.default_backend() != "cpu":
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _machine() -> str:

@@ -184,8 +184,9 @@ def run_settle(options: argparse.Namespace) -> None:
     elif heights.dtype.kind != "f":
         heights = heights.astype(np.float32)
     from jaxsand import schemes
+    from jaxsand.rules import Outcome, UntilStill
     from jaxsand.scene import make_scene
-    from jaxsand.settling import Outcome, UntilStill, settle
+    from jaxsand.settling import settle
     from jaxsand.sim import OutcomeError, check
     from jaxsand.task import volume_error
 

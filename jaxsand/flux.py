@@ -18,8 +18,9 @@ that cell i gains.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -108,18 +109,37 @@ def worst_excess(bed: Bed, u: jax.Array, around: Nothing | Partial | None = None
     gate = None
     if isinstance(around, Partial):
         u, gate = halo(around.surface(at(u))), around.open
-    worst = jnp.zeros((), u.dtype)
-    for e in _excesses(bed, gate, u):
-        worst = jnp.maximum(worst, jnp.max(jnp.max(jnp.where(e > 0, e, 0), axis=0)))  # NaN means no link
+    worst = jnp.max(_highest(_excesses(bed, gate, u)))
     if bed.rim is not None:
         worst = jnp.maximum(worst, jnp.max(2 * _over(bed, bed.rim, at(u)) * (_draining_sides(bed.rim) > 0)))
     return worst / bed.spacing
 
 
+def middle(bed: Bed, u: jax.Array, tolerance: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Row and column of the middle of the box around all that is steeper than repose by more than the tolerance."""
+    moving: Any = False
+    for e in _excesses(bed, None, u):
+        moving = moving | (e > tolerance * bed.spacing)
+    bounds = []
+    for axis in (1, 0):
+        n = moving.shape[1 - axis]
+        busy = jnp.any(moving, axis=axis)
+        first, last = jnp.min(jnp.where(busy, jnp.arange(n), n)), jnp.max(jnp.where(busy, jnp.arange(n), 0))
+        bounds.append((first + last + 1).astype(u.dtype) / 2)
+    return bounds[0], bounds[1]
+
+
 def steepest(bed: Bed, u: jax.Array) -> jax.Array:
     """The steepest slope (a tangent) of a map with halo, as its neighbourhood measures slopes."""
-    steep = [jnp.max(jnp.where(slope > 0, slope, 0)) for slope, _ in _slopes(bed, u)]
-    return jnp.max(jnp.stack(steep)) / bed.spacing
+    return jnp.max(_highest(slope for slope, _ in _slopes(bed, u))) / bed.spacing
+
+
+def _highest(maps: Iterable[jax.Array]) -> jax.Array:
+    """Cell by cell the highest of the maps, at least 0; NaN means no link."""
+    worst: Any = 0.0
+    for e in maps:
+        worst = jnp.where(e > worst, e, worst)
+    return jnp.max(worst, axis=0)  # rows first: XLA vectorises that
 
 
 def ends(u: jax.Array, di: int, dj: int) -> tuple[jax.Array, jax.Array]:
@@ -147,11 +167,14 @@ def link_flux(bed: Bed, gate: jax.Array | None, s: jax.Array, link: Link) -> jax
 
 
 def _slopes(bed: Bed, u: jax.Array) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Slopes and the largest stable ones, times the spacing."""
+    """Slopes [H, W] and the largest stable ones, times the spacing: of links in one direction, or of gradients."""
     if bed.neighbours != "isotropic":
         for link in links(bed.neighbours):
-            here, there = ends(u, *link[:2])
-            yield jnp.abs(there - here) * (1 / link[2]), _yield(bed, link) * (1 / link[2])
+            di, dj, length = link
+            level = bed.drop
+            if level.ndim:
+                level = (level + at(halo(level, 0.0), di, dj)) / 2
+            yield jnp.abs(at(u, di, dj) - at(u)) * (1 / length), level
         return
     x, y = _steps(u)
     for gx, gy, m in _triangles(bed, x / bed.spacing, y / bed.spacing):
@@ -163,8 +186,8 @@ def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Ar
     if gate is None:
         yield from (slope - level for slope, level in _slopes(bed, u))
     elif bed.neighbours != "isotropic":
-        for (slope, level), link in zip(_slopes(bed, u), links(bed.neighbours), strict=True):
-            yield (slope - level) * jnp.minimum(*ends(gate, *link[:2]))
+        for (slope, level), (di, dj, _) in zip(_slopes(bed, u), links(bed.neighbours), strict=True):
+            yield (slope - level) * jnp.minimum(at(gate), at(gate, di, dj))
     else:
         x, y = _steps(u)
         for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):

@@ -12,8 +12,8 @@ from jaxsand.bed import Lost, halo, largest, mark, nothing_lost, prepare, quantu
 from jaxsand.displace import Job
 from jaxsand.flux import worst_excess
 from jaxsand.grid import centres
+from jaxsand.rules import Outcome
 from jaxsand.scene import Scene
-from jaxsand.settling import Outcome
 from jaxsand.sweep import Flow
 from jaxsand.tool import NoTool, Pose, local
 from jaxsand.window import Window

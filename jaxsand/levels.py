@@ -31,11 +31,11 @@ def descend(
     early = schedule(scheme.steps(), limit, bound, interval, scheme.handover / 4 if level else 0.0)
     narrow = max(rows, columns) if 1 in (rows, columns) else min(rows, columns)
     if narrow < 2 * scheme.coarsest:
-        return march(bed, cells, early, tolerance, bound // interval, interval, sand)
+        return march(bed, cells, early, tolerance, interval).run(bound // interval, sand)
     # To the first end of a group past the handover that is also the end of a step.
     ends = early.starts[(early.times >= scheme.handover) & (early.starts % interval == 0)]
     groups = int(ends[0]) // interval if ends.size else bound // interval
-    sand, taken = march(bed, cells, early, tolerance, groups, interval, sand)
+    sand, taken = march(bed, cells, early, tolerance, interval).run(groups, sand)
 
     grain = quantum(largest(at(sand[0])))
     wide_bed, wide_cells, wide = _widen(bed, cells, grain, at(sand[0]))
@@ -48,7 +48,7 @@ def descend(
     if gone is not None and lost is not None:
         gone = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), gone, lost)
     late = schedule(scheme.steps(), limit, bound, interval)
-    sand, again = march(bed, cells, late, tolerance, bound // interval, interval, (u, gone))
+    sand, again = march(bed, cells, late, tolerance, interval).run(bound // interval, (u, gone))
     return sand, taken + again + jnp.where(early_end, 0, (more + 3) // 4)
 
 

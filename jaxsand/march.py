@@ -1,5 +1,7 @@
 """How a scheme marches: groups of sweeps until the map is still, on one grid."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -8,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.bed import Bed, Lost, at, largest, quantum, truncate
+from jaxsand.bed import Bed, Lost, grain, truncate
 from jaxsand.flux import Fluxes, Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
 from jaxsand.grid import links
 from jaxsand.loop import repeat_until
@@ -18,33 +20,56 @@ from jaxsand.sweep import Flow, apply, surge, sweep
 Sand = tuple[jax.Array, Lost]  # a map with halo, and what it lost over the rim
 
 
+@dataclass(frozen=True)
+class March:
+    """Sweeps in groups of `interval` until no slope exceeds repose by more than a tolerance.
+
+    `begin(sand)` is the state before the first group, whose first two members are the sand; `body(params, k, state)` the one
+    after group k; `done(params, k, state)` says whether to stop before group k; `between(k)` whether the sand alone is all
+    the state there.
+    """
+
+    begin: Callable[[Sand], Any]
+    body: Callable
+    done: Callable
+    between: Callable[[jax.Array], Any]
+    params: Any
+    interval: int
+
+    def run(self, groups: int, sand: Sand) -> tuple[Sand, jax.Array]:
+        """The sand after at most so many groups, and the number of sweeps."""
+        state, taken = repeat_until(self.done, self.body, groups, self.params, self.begin(sand))
+        return (state[0], state[1]), taken * self.interval
+
+
 def march(
     bed: Bed,
     around: Nothing | Partial,
     scheme: Relaxation | Pairwise | Schedule,
     tolerance: jax.Array | None,
-    groups: int,
     interval: int,
-    sand: Sand,
-) -> tuple[Sand, jax.Array]:
-    """Sweeps in groups of `interval` until no slope exceeds repose by more than the tolerance (None: to the last group), at
-    most `groups` of them: the sand and the number of sweeps.
+) -> March:
+    """How the scheme marches on this bed; without a tolerance it is never done.
 
     The quantum follows the largest height down, so that a spike leaves sand as smooth as its remains allow.
     """
-    state: Any = sand
+    begin: Any
     body: Any
     done: Any
+    between: Any
+    rate: Any
     if isinstance(scheme, Schedule):
-        state = (*sand, fluxes_zero(bed, sand[0]))
+        begin = partial(_with_momentum, bed)
         body = partial(_steps, scheme, interval)
-        rate: Any = float(scheme.rates[-1])
+        rate = float(scheme.rates[-1])
         done = partial(_still_after_a_step, scheme, interval)
+        between = partial(_between_steps, scheme, interval)
         params: Any = (bed, around, tolerance)
     else:
+        begin = _as_it_is
         body = partial(_pairs if isinstance(scheme, Pairwise) else _sweeps, interval)
         rate = scheme.share / 2 if isinstance(scheme, Pairwise) else scheme.rate
-        done = _still
+        done, between = _still, _always
         params = (bed, around, tolerance, rate)
     if tolerance is None:
         done = _never
@@ -52,8 +77,19 @@ def march(
         quanta = 4 if isinstance(scheme, Pairwise) and bed.rim is not None else 2
         floor = lax.stop_gradient(quanta / (rate * bed.spacing))
         params = (*params[:2], (tolerance, floor), *params[3:])
-    state, taken = repeat_until(done, body, groups, params, state)
-    return (state[0], state[1]), taken * interval
+    return March(begin, body, done, between, params, interval)
+
+
+def _with_momentum(bed: Bed, sand: Sand) -> Any:
+    return (*sand, fluxes_zero(bed, sand[0]))
+
+
+def _as_it_is(sand: Sand) -> Any:
+    return sand
+
+
+def _always(k: jax.Array) -> jax.Array:
+    return jnp.ones((), bool)
 
 
 def still(bed: Bed, around: Nothing | Partial, limits: tuple[jax.Array, jax.Array], u: jax.Array) -> jax.Array:
@@ -61,7 +97,7 @@ def still(bed: Bed, around: Nothing | Partial, limits: tuple[jax.Array, jax.Arra
     tolerance, floor = limits
     if bed.neighbours == "isotropic":  # the larger part of a gradient moves at least 1/(4 sqrt(2)) of its excess
         floor = 3 * floor
-    return worst_excess(bed, u, around) <= jnp.maximum(tolerance, floor * quantum(largest(at(u))))
+    return worst_excess(bed, u, around) <= jnp.maximum(tolerance, floor * grain(bed, u))
 
 
 def _never(params: Any, k: jax.Array, state: Any) -> jax.Array:
@@ -74,36 +110,40 @@ def _still(params: Any, k: jax.Array, state: Any) -> jax.Array:
 
 
 def _still_after_a_step(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any) -> jax.Array:
-    return jnp.any(jnp.asarray(plan.starts) == k * interval) & _still(params, k, state)
+    return _between_steps(plan, interval, k) & _still(params, k, state)
+
+
+def _between_steps(plan: Schedule, interval: int, k: jax.Array) -> jax.Array:
+    return jnp.any(jnp.asarray(plan.starts) == k * interval)
 
 
 def _sweeps(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
     bed, around, _, rate = params
-    flow = Flow(jnp.asarray(rate), quantum(largest(at(state[0]))))
+    flow = Flow(jnp.asarray(rate), grain(bed, state[0]))
     return lax.fori_loop(0, interval, lambda _, s: sweep(bed, flow, around, *s), state)
 
 
 def _steps(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any) -> Any:
     bed, around, _ = params
     dtype = state[0].dtype
-    grain = quantum(largest(at(state[0])))
+    cut = grain(bed, state[0])
     starts, rates = jnp.asarray(plan.starts), jnp.asarray(plan.rates, dtype)
 
     def stage(i: jax.Array, s: tuple[jax.Array, Lost, Fluxes]) -> tuple[jax.Array, Lost, Fluxes]:
         n = k * interval + i
         step = jnp.sum(starts <= n) - 1
         before = (n - starts[step]).astype(dtype)  # stages of this step already taken
-        flow = Flow(rates[step] * (2 - 1 / (before + 1)), grain)
+        flow = Flow(rates[step] * (2 - 1 / (before + 1)), cut)
         return surge(bed, flow, before / (before + 1), around, s)
 
     u, lost, last = state
-    u, lost, last = lax.fori_loop(0, interval, stage, (u, lost, tuple(m / grain for m in last)))
-    return u, lost, tuple(m * grain for m in last)
+    u, lost, last = lax.fori_loop(0, interval, stage, (u, lost, tuple(m / cut for m in last)))
+    return u, lost, tuple(m * cut for m in last)
 
 
 def _pairs(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
     bed, _, _, half = params
-    flow = Flow(jnp.asarray(half), quantum(largest(at(state[0]))))
+    flow = Flow(jnp.asarray(half), grain(bed, state[0]))
     return lax.fori_loop(0, interval, lambda _, s: _each_pair(bed, flow, *s), state)
 
 

@@ -67,17 +67,20 @@ def make_scene(
     )
     _check_walls(scene.walls, shape)
     _check_edge(scene.edge)
-    _check_window(scene.window, shape)
+    check_window(scene.window, shape)
     _check_tool(scene.tool, scene.grid)
     return scene
 
 
 def volume(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
-    """Volume of the sand above height 0 (m^3): dx^2 times the sum over the cells that are not solid. Differentiable."""
+    """Volume of the sand above height 0 (m^3): dx^2 times the sum over the cells that are not solid. Differentiable.
+
+    Summed in the height's dtype; `volume_error` tells in float64 whether sand was lost.
+    """
     scene, height = fit(scene, height)
     if isinstance(scene.walls, Walls):
         height = jnp.where(scene.walls.solid, 0, height)
-    return jnp.sum(height) * jnp.asarray(scene.grid.spacing, height.dtype) ** 2
+    return jnp.sum(jnp.sum(height, axis=0)) * jnp.asarray(scene.grid.spacing, height.dtype) ** 2
 
 
 def fit(scene: Scene, height: jax.typing.ArrayLike) -> tuple[Scene, jax.Array]:
@@ -192,7 +195,7 @@ def _check_edge(edge: Any) -> None:
         raise ValueError(f"edge: got {edge!r}; give Closed() or Draining(level)")
 
 
-def _check_window(window: Any, shape: tuple[int, int]) -> None:
+def check_window(window: Any, shape: tuple[int, int]) -> None:
     if isinstance(window, Window):
         try:
             inside = len(window.size) == 2 and all(

@@ -112,8 +112,9 @@ def schedule(scheme: SuperTimeStepping, limit: float, sweeps: int, group: int, e
     A step shorter than a group does not reach over its end; a longer one is a number of whole groups.
     """
     c = scheme.safety * limit
-    starts, rates, times, done, time = [], [], [], 0, elapsed
-    while done < sweeps:
+    starts: list[int] = []
+    rates, times, done, time = [], [], 0, elapsed
+    while not starts or done < sweeps:
         starts.append(done)
         times.append(time)
         step = max(scheme.first, scheme.growth * time)

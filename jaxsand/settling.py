@@ -1,68 +1,24 @@
 """Settling: the sand flows until no slope is steeper than repose."""
 
-from dataclasses import dataclass, field
-from enum import IntFlag
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
-from jaxsand.bed import at, halo, mark, nothing_lost, prepare, sound, spoiled, unmark, volume_lost
-from jaxsand.flux import Nothing, steepest, worst_excess
+from jaxsand.batch import march_batch, on_all_cores, wide_vectors
+from jaxsand.bed import Bed, Lost, at, halo, largest, mark, nothing_lost, prepare, sound, spoiled, unmark, volume_lost
+from jaxsand.flux import Nothing, middle, steepest, worst_excess
 from jaxsand.levels import descend, start
-from jaxsand.march import march
-from jaxsand.scene import Scene, cast, concrete, fit
-from jaxsand.schemes import (
-    Multilevel,
-    Pairwise,
-    Relaxation,
-    Scheme,
-    SuperTimeStepping,
-    schedule,
-    stable_rate,
-)
+from jaxsand.march import March, Sand, march
+from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window
+from jaxsand.scene import Scene, cast, fit
+from jaxsand.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
+from jaxsand.window import Whole, Window, cut, edge_movement, origin, paste
 
-
-class Outcome(IntFlag):
-    """What a result has to say for itself; 0 is a clean one. See `check`."""
-
-    NOT_STILL = 1
-    """Some slope is still steeper than repose by more than the tolerance."""
-    WINDOW_EDGE = 2
-    """Sand moved at the edge of the window while the tool was down."""
-    NOT_FINITE = 4
-    """The map, the stroke or the scene holds a NaN or an infinity, the heights overflowed, or the stroke lies farther away
-    than the floats resolve. A bad cell of the map was treated as solid and given back as it was."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class UntilStill:
-    """Sweep until no slope (a tangent) exceeds repose by more than `tolerance`, at most `bound` sweeps.
-
-    Looks every `interval` sweeps, so that the number of sweeps is a multiple of it (and 0 on a map that is still). Where the
-    floats are too coarse to move sand down to the tolerance (large offsets in float32), it stops when nothing moves any more
-    and the outcome says NOT_STILL. Differentiable once, in forward and reverse mode (see `loop.repeat_until`).
-    """
-
-    tolerance: jax.Array | float = 1e-3
-    bound: int = field(default=20_000, metadata={"static": True})
-    interval: int = field(default=8, metadata={"static": True})
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Sweeps:
-    """Exactly `count` sweeps; `tolerance` only judges the outcome. Differentiable once, in forward and reverse mode."""
-
-    count: int = field(metadata={"static": True})
-    tolerance: jax.Array | float = 1e-3
-
-
-Stop = UntilStill | Sweeps
+_WHOLE = Whole()
 
 
 @jax.tree_util.register_dataclass
@@ -84,21 +40,26 @@ def settle(
     *,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
+    window: Whole | Window | None = None,
 ) -> Settled:
     """Lets a map [H, W] (m) settle to its angle of repose. One map; batch with `jax.vmap` or `settle_batch`.
 
     Conserves volume up to what sweep.py says of rounding, keeps the map within its lowest and highest point at the rates
     that `Relaxation` names, commutes with adding a constant, with h -> -h, mirrors and quarter turns, and leaves a settled
     map as it is, to the last bit.
+    With a `window` it settles a block of that size around what is too steep. When nothing within two cells of the block's
+    edge (where that is not the map's) ends more than the window's tolerance, in spacings, from where it began, and the rest
+    was still, that is what settling everywhere gives; else the outcome says WINDOW_EDGE or NOT_STILL.
+
     Computes in the height's dtype. Differentiable in the height and the angle of repose, by what `stop` says of itself.
 
     Raises:
       ValueError: for a height of the wrong shape or dtype, or a scheme or stop rule out of range.
     """
     scheme, stop = check_rule(scene, scheme, stop)
+    window = check_settling_window(scene, scheme, window)
     scene, height = fit(scene, height)
-    scheme, stop = cast((scheme, stop), height.dtype)
-    return _settle(scene, height, scheme, stop)
+    return _settle(scene, height, *cast((scheme, stop, window), height.dtype))
 
 
 def settle_batch(
@@ -107,7 +68,8 @@ def settle_batch(
     *,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
-    chunk: int = 256,
+    window: Whole | Window | None = None,
+    chunk: int | None = None,
 ) -> Settled:
     """Lets a batch of maps [B, H, W] of one scene settle; every field of the result gains the batch axis.
 
@@ -116,11 +78,13 @@ def settle_batch(
     call it as it is, not inside `jit`, `grad` or `vmap`.
     """
     scheme, stop = check_rule(scene, scheme, stop)
+    window = check_settling_window(scene, scheme, window)
     height = as_batch(height)
     check_chunk(chunk)
     scene, _ = fit(scene, height[0])
-    scheme, stop = cast((scheme, stop), height.dtype)
-    return _batch_program()(scene, height, scheme, stop, chunk=min(chunk, height.shape[0]))
+    rules = cast((scheme, stop, window), height.dtype)
+    program = partial(_batch_program(), scene, rules=rules)
+    return on_all_cores(lambda maps, chunk: program(maps, chunk=chunk), height, chunk)
 
 
 def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
@@ -130,112 +94,86 @@ def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     return steepest(prepare(scene), halo(marked))
 
 
-def check_rule(scene: Scene, scheme: Scheme | None, stop: Stop | None) -> tuple[Scheme, Stop]:
-    """The scheme and stop rule, by default SuperTimeStepping() and UntilStill(), if they are in range."""
-    scheme = SuperTimeStepping() if scheme is None else scheme
-    stop = UntilStill() if stop is None else stop
-    _check_scheme(scene, scheme)
-    if isinstance(stop, UntilStill):
-        for name, count in (("bound", stop.bound), ("interval", stop.interval)):
-            check_whole(f"stop.{name}", count, 1)
-    elif isinstance(stop, Sweeps):
-        check_whole("stop.count", stop.count, 0)
-        if isinstance(scheme, Multilevel):
-            raise ValueError("stop: got Sweeps with Multilevel, which settles until still; give UntilStill()")
-    else:
-        raise ValueError(f"stop: got {stop!r}; give UntilStill() or Sweeps(count)")
-    tolerance = concrete(stop.tolerance)
-    if tolerance is not None and not ((tolerance >= 0) & (tolerance < float("inf"))).all():
-        raise ValueError(f"stop.tolerance: got {stop.tolerance!r}; give a slope of 0 or more, such as 1e-3")
-    return scheme, stop
-
-
-def _check_scheme(scene: Scene, scheme: Scheme) -> None:
-    if isinstance(scheme, Relaxation):
-        check_rate(scene, "scheme.rate", scheme.rate)
-    elif isinstance(scheme, Pairwise):
-        share = concrete(scheme.share)
-        if share is not None and not ((share > 0) & (share <= 1)).all():
-            raise ValueError(f"scheme.share: got {scheme.share!r}; give a share above 0 and up to 1")
-        if scene.grid.neighbours == "isotropic":
-            raise ValueError("scheme: got Pairwise with isotropic sand, which does not flow in pairs; use 4 or 8 neighbours")
-    elif isinstance(scheme, SuperTimeStepping | Multilevel):
-        for name, value, most in (("growth", scheme.growth, 4), ("first", scheme.first, 1), ("safety", scheme.safety, 1)):
-            if not 0 < value <= most:
-                raise ValueError(f"scheme.{name}: got {value!r}; give a number above 0 and up to {most}")
-        if isinstance(scheme, Multilevel):
-            check_whole("scheme.coarsest", scheme.coarsest, 2)
-            if not 1 <= scheme.handover < float("inf"):
-                raise ValueError(f"scheme.handover: got {scheme.handover!r}; give a time of at least 1, such as 128")
-    else:
-        raise ValueError(f"scheme: got {scheme!r}; give Relaxation, Pairwise, SuperTimeStepping or Multilevel")
-
-
-def check_rate(scene: Scene, name: str, value: jax.typing.ArrayLike) -> None:
-    """Raises ValueError unless a rate is positive and in the scene's stable range."""
-    rate = concrete(value)
-    limit = stable_rate(scene)
-    if rate is not None and not (rate > 0).all():
-        raise ValueError(f"{name}: got {value!r}; give a positive share such as 0.125")
-    if rate is not None and not (rate <= limit).all():
-        raise ValueError(f"{name}: got {value!r}, unstable above {limit:.4f}; the paper uses 0.125")
-
-
-def as_batch(height: jax.typing.ArrayLike) -> jax.Array:
-    """The height as an array, if it is a batch [B, H, W]."""
-    height = jnp.asarray(height)
-    if height.ndim != 3 or not height.shape[0]:
-        raise ValueError(f"height: got shape {list(height.shape)}; give a batch of at least one map [B, H, W]")
-    return height
-
-
-def check_chunk(chunk: int) -> None:
-    """Raises ValueError unless `chunk` is a number of maps."""
-    check_whole("chunk", chunk, 1)
-
-
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Raises ValueError unless the value is a whole number of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name}: got {value!r}; give a whole number of at least {least}")
-
-
-def relax(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop) -> Settled:
+def relax(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE) -> Settled:
     """`settle` without its checks and casts, for use inside a program."""
     bed = prepare(scene)
-    marked, broken = mark(scene, height)
-    sand = (halo(marked), nothing_lost(bed, height))
-    tolerance = jnp.asarray(stop.tolerance)
-    limit = stable_rate(scene)
-    if isinstance(stop, Sweeps):
-        bound, interval = stop.count, next((n for n in range(8, 0, -1) if stop.count and stop.count % n == 0), 1)
+    sand = (halo(mark(scene, height)[0]), nothing_lost(bed, height))
+    if isinstance(window, Window):
+        sand, sweeps, touched = _in_window(scene, bed, window, scheme, stop, sand)
     else:
-        bound, interval = stop.bound, min(stop.interval, stop.bound)
-    if isinstance(scheme, Multilevel):
-        cells = start(scheme, marked)
-        sand, sweeps = descend(bed, cells, scheme, limit, tolerance, bound, interval, sand)
-    else:
-        plan = schedule(scheme, limit, bound, interval) if isinstance(scheme, SuperTimeStepping) else scheme
-        enough = None if isinstance(stop, Sweeps) else tolerance
-        sand, sweeps = march(bed, Nothing(), plan, enough, bound // interval, interval, sand)
+        sand, sweeps = _run(scene, bed, scheme, stop, sand)
+        touched = jnp.zeros((), bool)
+    return _judge(scene, bed, stop, height, sand, sweeps, touched)
+
+
+def _judge(
+    scene: Scene, bed: Bed, stop: Stop, height: jax.Array, sand: Sand, sweeps: jax.Array, touched: jax.Array
+) -> Settled:
+    """What there is to say of a map that was `height` and is now `sand`."""
     u, lost = sand
+    marked, broken = mark(scene, height)
     residual = worst_excess(bed, u)
     broken = broken | spoiled(marked, at(u)) | ~sound(bed)
-    outcome = Outcome.NOT_STILL * (residual > stop.tolerance) + Outcome.NOT_FINITE * broken
+    still = Outcome.NOT_STILL * (residual > stop.tolerance)
+    outcome = still + Outcome.WINDOW_EDGE * touched + Outcome.NOT_FINITE * broken
     settled = unmark(at(u), height)
     return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), volume_lost(bed, lost))
+
+
+def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tuple[Sand, jax.Array]:
+    """The sand at rest, or as far as the stop rule lets it go, and the sweeps that took."""
+    bound, interval = _groups(stop)
+    if isinstance(scheme, Multilevel):
+        tolerance = jnp.asarray(stop.tolerance)
+        return descend(bed, start(scheme, at(sand[0])), scheme, stable_rate(scene), tolerance, bound, interval, sand)
+    return _march(scene, bed, scheme, stop).run(bound // interval, sand)
+
+
+def _march(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop) -> March:
+    bound, interval = _groups(stop)
+    plan: Any = scheme
+    if isinstance(scheme, SuperTimeStepping):
+        plan = schedule(scheme, stable_rate(scene), bound, interval)
+    return march(bed, Nothing(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
+
+
+def _groups(stop: Stop) -> tuple[int, int]:
+    """The largest number of sweeps, and after how many of them to look."""
+    if isinstance(stop, Sweeps):
+        return stop.count, next((n for n in range(8, 0, -1) if stop.count and stop.count % n == 0), 1)
+    return stop.bound, min(stop.interval, stop.bound)
+
+
+def _in_window(
+    scene: Scene, bed: Bed, window: Window, scheme: Scheme, stop: Stop, sand: Sand
+) -> tuple[Sand, jax.Array, jax.Array]:
+    """`_run` on the block around what is too steep; also whether sand came within two cells of the block's edge."""
+    u, lost = sand
+    shape, h = scene.grid.shape, at(u)
+    begin = origin(window, shape, middle(bed, u, jnp.asarray(stop.tolerance)))
+    block, block_lost = cut(window, shape, begin, (h, lost))
+    here = replace(cut(window, shape, begin, bed), elsewhere=largest(paste(begin, h, jnp.zeros_like(block))))
+    (after, block_lost), sweeps = _run(scene, here, scheme, stop, (halo(block), block_lost))
+    change = edge_movement(window, shape, begin, block, at(after), jnp.zeros_like(block))
+    touched = change > window.tolerance * bed.spacing
+    return (halo(paste(begin, h, at(after))), paste(begin, lost, block_lost)), sweeps, touched
 
 
 _settle = jax.jit(relax)
 
 
-def _chunks(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, *, chunk: int) -> Settled:
-    return lax.map(lambda h: relax(scene, h, scheme, stop), height, batch_size=chunk)
+def _chunks(scene: Scene, height: jax.Array, rules: Any, *, chunk: int) -> Settled:
+    scheme, stop, window = rules
+    if isinstance(window, Window) or isinstance(scheme, Multilevel):
+        return lax.map(lambda h: relax(scene, h, *rules), height, batch_size=chunk)
+    bed, (bound, interval) = prepare(scene), _groups(stop)
 
+    def enter(h: jax.Array, lost: Lost) -> Sand:
+        return halo(mark(scene, h)[0]), lost
 
-def wide_vectors() -> dict[str, Any]:
-    """Compiler options for the outermost programs: 512-bit vectors where the CPU has them."""
-    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
+    way = _march(scene, bed, scheme, stop)
+    judge = partial(_judge, scene, bed, stop, touched=jnp.zeros((), bool))
+    return march_batch(way, bound // interval, enter, judge, height, nothing_lost(bed, height), chunk)
 
 
 @cache

@@ -15,8 +15,9 @@ import numpy as np
 from jaxsand import goals, task
 from jaxsand.planner import Cell, connected_pieces, plan
 from jaxsand.push import SteppedPush
+from jaxsand.rules import UntilStill
 from jaxsand.scene import Scene, make_scene
-from jaxsand.settling import UntilStill, settle, steepest_slope
+from jaxsand.settling import settle, steepest_slope
 from jaxsand.sim import Shaped, act, check, follow_frames
 from jaxsand.tool import Blade
 

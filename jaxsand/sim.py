@@ -8,22 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.batch import on_all_cores, wide_vectors
 from jaxsand.legs import Pushed
 from jaxsand.push import SteppedPush, push_along
+from jaxsand.rules import Outcome, Stop, as_batch, check_chunk, check_rate, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.schemes import Scheme
-from jaxsand.settling import (
-    Outcome,
-    Settled,
-    Stop,
-    as_batch,
-    check_chunk,
-    check_rate,
-    check_rule,
-    check_whole,
-    relax,
-    wide_vectors,
-)
+from jaxsand.settling import Settled, relax
 from jaxsand.swath import SwathPush, push_swath
 from jaxsand.tool import Pose
 
@@ -133,7 +124,7 @@ def step_batch(
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
-    chunk: int = 64,
+    chunk: int | None = None,
 ) -> Shaped:
     """`step` on a batch of maps [B, H, W] and strokes [B, 4] of one scene; every field of the result gains the batch axis.
 
@@ -145,7 +136,8 @@ def step_batch(
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; give [{height.shape[0]}, 4], one stroke for each map")
     check_chunk(chunk)
     scene, _, rules = _ready(scene, height[0], push, scheme, stop)
-    return _step_program()(scene, height, stroke.reshape(-1, 2, 2), rules, chunk=min(chunk, height.shape[0]))
+    program = partial(_step_program(), scene, rules=rules)
+    return on_all_cores(lambda some, chunk: program(*some, chunk=chunk), (height, stroke.reshape(-1, 2, 2)), chunk)
 
 
 class OutcomeError(RuntimeError):
@@ -153,13 +145,13 @@ class OutcomeError(RuntimeError):
 
 
 _ADVICE = {
+    Outcome.WINDOW_EDGE: (
+        "sand moved at the window's edge, or the map was not still before the tool came down: enlarge Window(size) or use "
+        "Whole(), and settle to the window's tolerance first"
+    ),
     Outcome.NOT_STILL: (
         "the sand is not still ({residual:.2g} in slope above repose after {sweeps} sweeps): raise the stop rule's bound or "
         "tolerance, or, where heights are large against the spacing, subtract their mean or use float64"
-    ),
-    Outcome.WINDOW_EDGE: (
-        "sand moved at the window's edge while the tool was down, or the map was not still before: enlarge Window(size) or "
-        "use Whole(), and settle to the window's tolerance first"
     ),
     Outcome.NOT_FINITE: (
         "the map, the stroke or the scene holds a NaN or an infinity, or heights overflowed: look with numpy.isfinite"
@@ -182,7 +174,7 @@ def check(result: Settled | Pushed) -> None:
         detail["residual"] = float(np.ravel(result.residual)[first])
         detail["sweeps"] = int(np.broadcast_to(result.sweeps, outcome.shape).ravel()[first])
     where = f"{bad.size} of {outcome.size} maps, first {int(first)}: " if outcome.ndim else ""
-    raise OutcomeError(where + "; ".join(_ADVICE[bit].format(**detail) for bit in code))
+    raise OutcomeError(where + "; ".join(advice.format(**detail) for bit, advice in _ADVICE.items() if bit in code))
 
 
 _Rules = tuple[Push, Scheme, Stop]

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.grid import Neighbours, links
+from jaxsand.rules import Outcome, UntilStill
 from jaxsand.scene import make_scene
 from jaxsand.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
-from jaxsand.settling import Outcome, Settled, UntilStill, settle, settle_batch, steepest_slope
+from jaxsand.settling import Settled, settle, settle_batch, steepest_slope
 from jaxsand.sim import rollout
 from jaxsand.task import volume_error
 from jaxsand.tool import Blade

@@ -1,4 +1,4 @@
-"""Where the sand settles while the tool moves."""
+"""Where the sand moves: a part of the map that alone is computed."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,11 +17,12 @@ class Whole:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Window:
-    """In a block of `size` cells (rows, columns) that follows the tool.
+    """In a block of `size` cells (rows, columns): as part of a scene one that follows the tool, given to `settle` one around
+    what is too steep (see there).
 
-    The map must be still when the tool comes down: no slope above repose by more than `tolerance`. If that does not hold, or
-    a cell within two cells of the block's edge (where that is not the map's) moves by more than `tolerance` spacings
-    while the tool advances by one sub-step, the outcome says WINDOW_EDGE: the result may then differ from that of `Whole`.
+    Under a tool the map must be still when the tool comes down: no slope above repose by more than `tolerance`. If that does
+    not hold, or a cell within two cells of the block's edge (where that is not the map's) moves by more than `tolerance`
+    spacings while the tool advances by one sub-step, the outcome says WINDOW_EDGE: the result may then differ from that of `Whole`.
     With tolerance 0 and no such outcome the two are equal up to the rounding of single operations.
     """
 

@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.rules import UntilStill
 from jaxsand.scene import Scene, make_scene
 from jaxsand.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
-from jaxsand.settling import UntilStill, settle
+from jaxsand.settling import settle
 
 Tell = Callable[[str], None]
 MU = math.tan(math.radians(29))

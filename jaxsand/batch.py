@@ -1,0 +1,130 @@
+"""How a batch of maps shares the machine: in chunks that stay in a core's cache, on every core, and without waiting.
+
+A chunk of maps marches together until one in eight of them still moves; those are set aside, and chunks made of them march
+on. So a slow map costs its own sweeps, not those of its neighbours, and every map is swept as it would be alone.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxsand.bed import Lost
+from jaxsand.march import March
+
+_CELLS = 65_536  # to a chunk: what the sweep of a chunk keeps at hand fits into a core's cache
+_LEFT = 8  # a chunk stops when one in so many of its maps is left
+Tree = Any
+
+
+def march_batch(
+    march: March, groups: int, enter: Callable, judge: Callable, height: jax.Array, lost: Lost, chunk: int
+) -> Tree:
+    """`March.run` for every map of a batch [B, H, W], B a multiple of the chunk.
+
+    `enter(height, lost)` makes the sand of a map; `judge(height, sand, sweeps)` says what became of it, with its `height`.
+    """
+    total = height.shape[0]
+    run = partial(_together, march, groups, enter, judge)
+    fresh = (height, lost, jnp.zeros(total, jnp.int32), jnp.zeros(total, bool))
+    chunks = jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), fresh)
+    state = lax.map(lambda some: run(total > chunk, *some), chunks)
+    state = jax.tree.map(lambda x: x.reshape(total, *x.shape[2:]), state)
+    if total > chunk:
+        state = lax.while_loop(lambda s: ~jnp.all(s[3]), partial(_left_over, run, chunk), state)
+    return state[0]
+
+
+def _left_over(run: Callable, chunk: int, state: Tree) -> Tree:
+    """Chunks of the maps that are left march on."""
+    _, _, taken, ready = state
+    order = jnp.argsort(jnp.where(ready, jnp.iinfo(jnp.int32).max, taken))
+    left = jnp.sum(~ready)
+
+    def one(i: jax.Array, state: Tree) -> Tree:
+        who = lax.dynamic_slice(order, (i * chunk,), (chunk,))
+        judged, *rest = jax.tree.map(lambda x: x[who], state)
+        after = run(left > chunk, judged.height, *rest)
+        return jax.tree.map(lambda x, y: x.at[who].set(y, unique_indices=True), state, after)
+
+    return lax.fori_loop(0, (left + chunk - 1) // chunk, one, state)
+
+
+def _together(
+    march: March, groups: int, enter: Callable, judge: Callable, others: Any, height: Any, lost: Any, taken: Any, ready: Any
+) -> Tree:
+    """Marches maps [chunk, ...] until all are ready; where there are `others`, until all but a few are."""
+    few = ready.shape[0] // _LEFT
+
+    def look(k: jax.Array, moving: Tree) -> jax.Array:
+        return (k >= groups) | march.done(march.params, k, moving)
+
+    def goes_on(carry: Tree) -> jax.Array:
+        _, _, taken, ready = carry
+        aside = others & (jnp.sum(~ready) <= few) & jnp.all(ready | jax.vmap(march.between)(taken))
+        return ~jnp.all(ready) & ~aside
+
+    def advance(carry: Tree) -> Tree:
+        moving, sand, taken, ready = carry
+        moving = jax.vmap(partial(march.body, march.params))(taken, moving)
+        sand = jax.tree.map(lambda x, y: jnp.where(ready.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, moving[:2])
+        taken = taken + ~ready
+        return moving, sand, taken, ready | jax.vmap(look)(taken, moving)
+
+    sand = jax.vmap(enter)(height, lost)
+    moving = jax.vmap(march.begin)(sand)
+    ready = ready | jax.vmap(look)(taken, moving)
+    _, sand, taken, ready = lax.while_loop(goes_on, advance, (moving, sand, taken, ready))
+    return jax.vmap(judge)(height, sand, taken * march.interval), sand[1], taken, ready
+
+
+def on_all_cores(run: Callable[..., Tree], batch: Tree, chunk: int | None) -> Tree:
+    """`run(batch, chunk=...)` on every core: the batch [B, ...] is cut into as many parts, of chunks of one size."""
+    leaves = jax.tree.leaves(batch)
+    total = leaves[0].shape[0]
+    if chunk is None:
+        chunk = max(1, _CELLS // math.prod(leaves[0].shape[1:])) if _on_cpu() else total
+    pieces = -(-total // chunk)
+    threads = min(cores(), pieces)
+    pieces = -(-pieces // threads) * threads
+    width = -(-total // pieces)
+    extra = pieces * width - total
+    if extra:
+        batch = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], extra, axis=0)]), batch)
+    if threads == 1:
+        out = run(batch, chunk=width)
+    else:
+        x64 = jnp.result_type(float) == jnp.float64  # which may hold for this thread alone
+
+        def part(one: Tree) -> Tree:
+            with jax.enable_x64(x64):
+                return jax.block_until_ready(run(one, chunk=width))
+
+        size = (total + extra) // threads
+        parts = [jax.tree.map(lambda x, i=i: x[i * size : (i + 1) * size], batch) for i in range(threads)]
+        with ThreadPoolExecutor(threads) as pool:
+            outs = list(pool.map(part, parts))
+        out = jax.tree.map(lambda *x: jnp.concatenate(x), *outs)
+    return jax.tree.map(lambda x: x[:total], out) if extra else out
+
+
+def cores() -> int:
+    """How many cores there are to compute on; 1 where something else than a CPU does."""
+    if not _on_cpu():
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def wide_vectors() -> dict[str, Any]:
+    """Compiler options for the outermost programs: 512-bit vectors where the CPU has them."""
+    return {"xla_cpu_prefer_vector_width": 512} if _on_cpu() else {}
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"

@@ -1,0 +1,92 @@
+"""The notebooks run from top to bottom on coarse grids, and what they say of their results is so."""
+
+import ast
+import io
+import json
+from pathlib import Path
+
+import jax
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import jaxsand as js
+
+NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
+NONE = pytest.param(None, marks=pytest.mark.skip(reason="no notebooks beside the tests"))
+FULL, SMALL = 'SIZE = "full"\n', 'SIZE = "small"\n'
+LARGEST = 300_000  # bytes
+
+
+def sources(notebook):
+    """The code of every code cell, by its id."""
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    return {cell["id"]: "".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"}
+
+
+def run(name, source, names):
+    """Runs a cell, and draws what a reader would see: open figures, and a figure on the last line."""
+    tree = ast.parse(source, name)
+    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+    exec(compile(tree, name, "exec"), names)
+    shown = eval(compile(ast.Expression(last.value), name, "eval"), names) if last else None
+    for figure in [*map(plt.figure, plt.get_fignums()), *([shown] if isinstance(shown, Figure) else [])]:
+        figure.savefig(io.BytesIO(), format="png", dpi=40)
+    plt.close("all")
+
+
+def settling(names):
+    """Checks what notebooks/settling.ipynb says."""
+    js.check(names["settled"])
+    sweeps, errors = names["sweeps"], names["errors"]
+    assert max(errors, key=errors.get) == "Pairwise"
+    assert max(sweeps, key=sweeps.get) == "Relaxation"
+    assert errors["SuperTimeStepping"] < 0.01
+    isotropic, octagon = names["cone_errors"]["isotropic"], names["cone_errors"][8]
+    assert isotropic[-1] < octagon[-1] / 2
+    assert isotropic[-1] < isotropic[0] * names["CONES"][0] / names["CONES"][-1]
+    assert octagon[-1] > 0.9 * octagon[-2]
+    assert {row["scheme"] for row in names["rows"]} == set(names["workprec"].SCHEMES)
+    whole, windowed = (np.asarray(names[k].height) for k in ("whole", "windowed"))
+    assert int(names["windowed"].outcome) == 0
+    assert np.abs(windowed - whole).max() <= 1e-6 * whole.max()
+    assert int(names["cramped"].outcome) & js.Outcome.WINDOW_EDGE
+    assert names["gradient"] < 0
+    assert names["gradient"] == pytest.approx(names["difference"], rel=1e-4)
+    assert np.all(np.diff(names["values"]) < 0)
+
+
+CHECKS = {"settling": settling}
+
+
+@pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")  # plt.show() where there is a display
+@pytest.mark.parametrize("notebook", NOTEBOOKS or [NONE], ids=lambda path: path.stem if path else "none")
+def test_a_notebook_runs_and_says_what_is_so(notebook):
+    cells = sources(notebook)
+    assert sum(f"{source}\n".count(FULL) for source in cells.values()) == 1
+    matplotlib.use("Agg")
+    names = {"__name__": "__main__"}
+    before = jax.config.jax_enable_x64
+    try:
+        with jax.enable_x64(False):  # as its readers run it
+            for name, source in cells.items():
+                run(f"{notebook.name}, cell {name}", f"{source}\n".replace(FULL, SMALL), names)
+    finally:
+        plt.close("all")
+        jax.config.update("jax_enable_x64", before)
+    assert names["SIZE"] == "small"
+    if notebook.stem in CHECKS:
+        CHECKS[notebook.stem](names)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS or [NONE], ids=lambda path: path.stem if path else "none")
+def test_a_notebook_is_small_and_clean(notebook):
+    """No outputs that a run could contradict; ids for every cell."""
+    assert notebook.stat().st_size < LARGEST
+    content = json.loads(notebook.read_text(encoding="utf-8"))
+    assert (content["nbformat"], content["nbformat_minor"]) >= (4, 5)
+    ids = [cell["id"] for cell in content["cells"]]
+    assert len(set(ids)) == len(ids)
+    assert not any(cell.get("outputs") for cell in content["cells"])
