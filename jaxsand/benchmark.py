@@ -108,6 +108,9 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
         "settle_batch, growth 0.8": Way(
             lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8))), batch, count
         ),
+        "settle_batch, growth 0.8, first 1/16": Way(
+            lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8, 1 / 16))), batch, count
+        ),
         "settle_batch, paper's sweep": Way(lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, count),
         f"settle_batch, {fixed} of the paper's sweeps": Way(
             lambda: ours(settle_batch(scene, heights, scheme=Relaxation(), stop=Sweeps(fixed))), batch, count

@@ -75,7 +75,7 @@ def make_scene(
 def volume(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     """Volume of the sand above height 0 (m^3): dx^2 times the sum over the cells that are not solid. Differentiable.
 
-    Summed in the height's dtype; `volume_error` tells in float64 whether sand was lost.
+    Summed in the height's dtype; `jaxsand.task.volume_error` tells in float64 whether sand was lost.
     """
     scene, height = fit(scene, height)
     if isinstance(scene.walls, Walls):

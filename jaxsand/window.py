@@ -22,8 +22,8 @@ class Window:
 
     Under a tool the map must be still when the tool comes down: no slope above repose by more than `tolerance`. If that does
     not hold, or a cell within two cells of the block's edge (where that is not the map's) moves by more than `tolerance`
-    spacings while the tool advances by one sub-step, the outcome says WINDOW_EDGE: the result may then differ from that of `Whole`.
-    With tolerance 0 and no such outcome the two are equal up to the rounding of single operations.
+    spacings while the tool advances by one sub-step, the outcome says WINDOW_EDGE: the result may then differ from that of
+    `Whole`. With tolerance 0 and no such outcome the two are equal up to the rounding of single operations.
     """
 
     size: tuple[int, int] = field(metadata={"static": True})

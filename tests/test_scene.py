@@ -33,7 +33,7 @@ BAD = {
     "angle not finite": (made(SHAPE, 0.01, np.nan), "repose_angle: got nan"),
     "one bad cell angle": (made(SHAPE, 0.01, np.where(np.arange(72).reshape(SHAPE) == 7, 2.0, 0.5)), "repose_angle: got 2.0"),
     "angles of another shape": (made(SHAPE, 0.01, np.full((3, 3), 0.5)), r"repose_angle: got shape \[3, 3\]"),
-    "six neighbours": (made(SHAPE, 0.01, 0.5, 6), "neighbours: got 6; choose 4 or 8"),
+    "six neighbours": (made(SHAPE, 0.01, 0.5, 6), 'neighbours: got 6; choose 4, 8 or "isotropic"'),
     "walls of another shape": (made(walls=js.Walls(np.zeros((3, 3), bool))), r"walls\.solid: got bool of shape \[3, 3\]"),
     "walls of numbers": (made(walls=js.Walls(np.zeros(SHAPE))), r"walls\.solid: got float64"),
     "walls by name": (made(walls="open"), "walls: got 'open'"),

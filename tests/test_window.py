@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.task import volume_error
 
 from .conftest import ANGLE
 
@@ -86,3 +87,60 @@ def test_one_row_and_one_column():
             out = js.step(scene, np.zeros(shape), stroke)
             assert np.all(np.isfinite(out.height))
             assert abs(float(out.height.sum())) < 1e-12
+
+
+def heaps(many=24):
+    """Columns of sand of all sizes, somewhere on level sand."""
+    rng = np.random.default_rng(5)
+    h = np.zeros((many, *SHAPE), "float32")
+    for one in h:
+        i, j, a, b = rng.integers(15, 45), rng.integers(15, 50), *rng.integers(2, 9, 2)
+        one[i : i + a, j : j + b] = rng.uniform(0.01, 0.12)
+    return h
+
+
+@pytest.mark.parametrize("neighbours", [4, 8, "isotropic"])
+@pytest.mark.parametrize("scheme", [js.Relaxation(), js.SuperTimeStepping()])
+def test_settling_in_a_window_is_equal_or_flagged(scheme, neighbours):
+    walls = js.Walls(jnp.zeros(SHAPE, bool).at[30, 10:60].set(True))
+    scene = js.make_scene(SHAPE, DX, ANGLE, neighbours, walls=walls)
+    h = heaps()
+    whole = js.settle_batch(scene, h, scheme=scheme)
+    clean = []
+    for size in ((12, 12), (26, 26), (40, 40)):
+        out = js.settle_batch(scene, h, scheme=scheme, window=js.Window(size, tolerance=0.0))
+        change = np.abs(np.asarray(out.height) - whole.height).max((1, 2))
+        same = change <= (1e-6 if neighbours == "isotropic" else 0)  # rounding of square roots, on heights of 0.1
+        flagged = np.asarray(out.outcome) != 0
+        assert np.all(same | flagged)
+        assert np.array_equal(out.sweeps[~flagged], whole.sweeps[~flagged])
+        assert max(volume_error(a, b) for a, b in zip(h, out.height, strict=True)) <= 1e-6
+        clean.append(int(np.sum(~flagged)))
+    assert clean[0] < 6
+    assert clean[2] == 24
+
+
+def test_a_window_in_a_window_drains_and_has_gradients():
+    scene = js.make_scene(SHAPE, DX, ANGLE, edge=js.Draining(0.0))
+    h = np.zeros(SHAPE)
+    h[2:8, 3:9] = 0.06
+    window = js.Window((30, 30), 0.0)
+    whole, out = js.settle(scene, h), js.settle(scene, h, window=window)
+    assert np.array_equal(whole.height, out.height)
+    assert float(whole.drained) == float(out.drained) > 0
+
+    def spread(scale, window):
+        return jnp.sum(js.settle(scene, scale * h, window=window).height ** 2)
+
+    assert np.isclose(*(jax.grad(spread)(1.0, w) for w in (None, window)), rtol=1e-12)
+
+
+def test_two_heaps_far_apart_are_flagged():
+    h = np.zeros(SHAPE)
+    h[5:8, 5:8] = h[60:63, 70:73] = 0.1
+    out = js.settle(sand(), h, window=js.Window((30, 30)))
+    assert int(out.outcome) & js.Outcome.NOT_STILL
+    with pytest.raises(ValueError, match="window"):
+        js.settle(sand(), h, window=js.Window((30, 30)), scheme=js.Multilevel())
+    with pytest.raises(ValueError, match="window.size"):
+        js.settle(sand(), h, window=js.Window((300, 30)))
