@@ -127,14 +127,15 @@ def _steps(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any)
     bed, around, _ = params
     dtype = state[0].dtype
     cut = grain(bed, state[0])
-    starts, rates = jnp.asarray(plan.starts), jnp.asarray(plan.rates, dtype)
+    starts = jnp.asarray(plan.starts)[:, None]
+    now = (k * interval + jnp.arange(interval, dtype=jnp.int32))[None, :]
+    begun = starts <= now
+    taken = (now[0] - jnp.max(jnp.where(begun, starts, 0), axis=0)).astype(dtype)  # stages of the same step before this one
+    rates = jnp.asarray(plan.rates, dtype)[jnp.sum(begun, axis=0) - 1] * (2 - 1 / (taken + 1))
+    momenta = taken / (taken + 1)
 
     def stage(i: jax.Array, s: tuple[jax.Array, Lost, Fluxes]) -> tuple[jax.Array, Lost, Fluxes]:
-        n = k * interval + i
-        step = jnp.sum(starts <= n) - 1
-        before = (n - starts[step]).astype(dtype)  # stages of this step already taken
-        flow = Flow(rates[step] * (2 - 1 / (before + 1)), cut)
-        return surge(bed, flow, before / (before + 1), around, s)
+        return surge(bed, Flow(rates[i], cut), momenta[i], around, s)
 
     u, lost, last = state
     u, lost, last = lax.fori_loop(0, interval, stage, (u, lost, tuple(m / cut for m in last)))
