@@ -67,17 +67,16 @@ def test_the_gradient_of_settling_is_that_of_its_sweeps():
 
 def test_gradients_under_vmap_and_jit_and_where_nothing_changes():
     scene = js.make_scene(SHAPE, 0.01, ANGLE, tool=js.Blade())
-    strokes = jnp.array([[0.0513, 0.0627, 0.1531, 0.1042], [0.1017, 0.0533, 0.1241, 0.1529], [5.0, 5.0, 6.0, 6.0]])
+    strokes = jnp.array([[0.0513, 0.0627, 0.1531, 0.1042], [0.1017, 0.0533, 0.1241, 0.1529], [5.0, 5.0, 6.0, 6.0], [0.1] * 4])
 
     def f(s):
         return jnp.sum(WEIGHTS * js.step(scene, jnp.zeros(SHAPE), s).height)
 
     many = jax.jit(jax.vmap(jax.grad(f)))(strokes)
-    assert np.allclose(many[0], jax.grad(f)(strokes[0]), rtol=1e-9)
     summed = jax.grad(lambda s: jax.vmap(f)(s).sum())(strokes)
     assert np.allclose(many, summed, rtol=1e-9, atol=1e-12)
     assert np.array_equal(many[2], np.zeros(4))
-    assert np.all(np.isfinite(jax.grad(f)(jnp.array([0.1, 0.1, 0.1, 0.1]))))  # no length: finite all the same
+    assert np.all(np.isfinite(many[3]))  # no length: finite all the same
 
 
 def test_second_derivatives_are_refused():
@@ -90,7 +89,7 @@ def test_second_derivatives_are_refused():
     for stop in (None, js.Sweeps(4)):
         for twice in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
             with pytest.raises(NotImplementedError, match="second derivatives .*are not available"):
-                twice(lambda h, stop=stop: f(h, stop))(h)
+                jax.make_jaxpr(twice(lambda h, stop=stop: f(h, stop)))(h)
 
 
 @pytest.mark.parametrize("bound", [1, 7, 100])

@@ -68,7 +68,7 @@ def test_symmetries_hold(neighbours):
 
 @pytest.mark.parametrize("neighbours", NEIGHBOURS)
 def test_super_time_stepping_is_faithful_and_needs_few_sweeps(neighbours):
-    h = column(48)
+    h = column(32 if neighbours == "isotropic" else 48)
     scene = js.make_scene(h.shape, 1.0, ANGLE, neighbours)
     end = limit(scene, h)
     slow, fast = js.settle(scene, h, scheme=js.Relaxation()), js.settle(scene, h)
@@ -147,19 +147,16 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
     bed, best = prepare(scene), stable_rate(scene)
     quanta = quantum(jnp.asarray(1.0))
 
+    @jax.jit
     def relaxed(rate):
-        u = halo(h)
-        for _ in range(12):
-            u, _ = sweep(bed, Flow(jnp.asarray(rate), quanta), Nothing(), u, None)
-        return u
+        return jax.lax.fori_loop(0, 12, lambda _, u: sweep(bed, Flow(rate, quanta), Nothing(), u, None)[0], halo(h))
 
-    def stepped(rate, stages=12):
-        state = (halo(h), None, fluxes_zero(bed, halo(h)))
-        for k in range(stages):
-            state = surge(
-                bed, Flow(jnp.asarray(rate * (2 - 1 / (k + 1))), quanta), jnp.asarray(k / (k + 1)), Nothing(), state
-            )
-        return state[0]
+    @jax.jit
+    def stepped(rate):
+        def stage(k, state):
+            return surge(bed, Flow(rate * (2 - 1 / (k + 1)), quanta), k / (k + 1), Nothing(), state)
+
+        return jax.lax.fori_loop(0, 12, stage, (halo(h), None, fluxes_zero(bed, halo(h))))[0]
 
     for march in (relaxed, stepped):
         inside, outside = (float(jnp.abs(at(march(x * best))[28:36, 28:36]).max()) for x in (0.98, 1.02))

@@ -231,7 +231,7 @@ def test_the_stable_range_is_where_the_checkerboard_stops_shrinking(neighbours, 
     st.sampled_from([4, 8]),
     st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_any_small_map_settles_or_says_why(rows, columns, degrees, spacing, dtype, neighbours, seed):
     h = (np.random.default_rng(seed).standard_normal((rows, columns)) * spacing * 10).astype(dtype)
     scene = js.make_scene(h.shape, spacing, math.radians(degrees), neighbours)
