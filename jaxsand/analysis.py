@@ -2,8 +2,10 @@
 moves could save. And the push: its error against its run time."""
 
 import math
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -16,7 +18,7 @@ from jaxsand.flux import Nothing
 from jaxsand.plain import settle_numpy
 from jaxsand.push import SteppedPush
 from jaxsand.rules import UntilStill
-from jaxsand.scene import make_scene
+from jaxsand.scene import Scene, make_scene
 from jaxsand.schemes import Relaxation
 from jaxsand.settling import relax, settle, settle_batch
 from jaxsand.sim import step_batch
@@ -41,7 +43,7 @@ def sweeps_against_rate(n: int = 32) -> list[dict[str, Any]]:
             (
                 2,
                 4 * COLUMN.heights(n),
-                np.array([0.02, 0.04, 0.06, 0.08, 0.1, 0.125, 1 / 6.83, 0.16, 0.18, 0.2, 1 / 4.83, 0.22, 0.25]),
+                np.array(_RATES),
             ),
         ):
             scene = make_scene((height.shape[0], height.shape[1]), 1.0, _ANGLE)
@@ -93,6 +95,55 @@ def activity(n: int = 160, sweeps: int = 1000) -> dict[str, Any]:
     }
 
 
+def chunks(scene: Scene, heights: jax.Array, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """Maps a second of `settle_batch` by the size of a chunk, called from one thread and from one for each core, and with a
+    tall column in one map of every 256 (`with_slow`; `sweeps` is then the largest number of sweeps, and the mean)."""
+    high, wide = heights.shape[1:]
+    middle = jnp.s_[high // 2 - 3 : high // 2 + 3, wide // 2 - 3 : wide // 2 + 3]
+    slow = heights.at[(slice(None, None, 256), *middle)].add(100 * scene.grid.spacing)
+    rows: list[dict[str, Any]] = []
+    for chunk in (8, 32, 64, 128, 256):
+        tell(f"chunks of {chunk}")
+        many = len(heights)
+
+        def rate(maps: jax.Array, chunk: int = chunk) -> float:
+            return len(maps) / _best(lambda: settle_batch(scene, maps, chunk=chunk).height)
+
+        row = {"name": f"chunks of {chunk}", "maps_per_second": rate(heights), "with_slow": rate(slow)}
+        with _one_core():
+            row["one_thread"] = rate(heights)
+        rows.append(row)
+    sweeps = settle_batch(scene, slow).sweeps
+    for row in rows:
+        row |= {"largest_sweeps": int(sweeps.max()), "mean_sweeps": float(sweeps.sum()) / many}
+    return rows
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    """Batches see one core; where a process cannot say where it runs, nothing changes."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    here = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(here)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, here)
+
+
+def _best(run: Callable[[], Any], turns: int = 5) -> float:
+    """Seconds of the best of a few turns after a first."""
+    jax.block_until_ready(run())
+    best = math.inf
+    for _ in range(turns):
+        began = time.perf_counter()
+        jax.block_until_ready(run())
+        best = min(best, time.perf_counter() - began)
+    return best
+
+
 def peer(batch: int = 256, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
     """60 x 30 cells of 10 mm, a block of 20 x 10 cells and 40 mm, 30 degrees: the case on which an open-source sand-shaping
     gym reports 671 iterations and 0.33 s in numpy."""
@@ -112,11 +163,7 @@ def peer(batch: int = 256, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
     maps = jnp.broadcast_to(jnp.asarray(h), (batch, 60, 30))
     for name, scheme in (("settle_batch, paper's sweep", Relaxation()), ("settle_batch", None)):
         settled = settle_batch(scene, maps, scheme=scheme)
-        best = math.inf
-        for _ in range(5):
-            began = time.perf_counter()
-            jax.block_until_ready(settle_batch(scene, maps, scheme=scheme).height)
-            best = min(best, (time.perf_counter() - began) / batch)
+        best = _best(partial(settle_batch, scene, maps, scheme=scheme)) / batch
         rows.append(
             {
                 "name": name,
@@ -146,11 +193,7 @@ def push_precision(batch: int = 64, tell: Tell = lambda _: None) -> list[dict[st
         name = f"sub-step {push.substep:g}, {push.sweeps} sweeps" if isinstance(push, SteppedPush) else "swath"
         tell(f"push: {name}")
         height = np.asarray(run(push=push).height, float)
-        seconds = math.inf
-        for _ in range(3):
-            began = time.perf_counter()
-            jax.block_until_ready(run(push=push).height)
-            seconds = min(seconds, time.perf_counter() - began)
+        seconds = _best(partial(run, push=push), 3)
         error = np.abs(height - best).sum() / np.abs(best).sum()
         rows.append({"name": name, "error": float(error), "pushes_per_second": batch / seconds})
     return rows

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import analysis, goals, stability, workprec
+from jaxsand import analysis, goals, piles, stability, workprec
 from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
@@ -52,15 +52,17 @@ def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int 
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
+        report["chunks"] = analysis.chunks(*_pushed(batch), tell)
         report["peer"] = analysis.peer(max(1, batch // 16), tell)
         if grids:
             report["reference"] = workprec.reference_check(tell)
-            report["work_precision"] = workprec.work_precision((*workprec.STIFF, workprec.RIDGE), tell, grids)
+            report["work_precision"] = workprec.work_precision(workprec.ALL, tell, grids)
             report["time_to_1_percent"] = workprec.time_to(report["work_precision"])
             report["growth"] = workprec.growth(report["time_to_1_percent"])
             report["sweeps_by_rate"] = analysis.sweeps_against_rate()
             report["sweeps_by_resolution"] = analysis.sweeps_against_resolution()
             report["activity"] = [analysis.activity()]
+            report["piles"] = piles.piles(tell, grids + 1)
     if what in ("push", "all"):
         report["push"] = bench_push(max(1, batch // 4), tell)
         if grids:
@@ -233,7 +235,7 @@ def table(report: dict[str, Any]) -> str:
     """The report as text."""
     lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
     for what, rows in report.items():
-        if isinstance(rows, list) and what not in ("map", "work_precision"):
+        if isinstance(rows, list) and rows and what not in ("map", "work_precision"):
             lines += ["", *as_table(rows, what.replace("_", " "))]
     return "\n".join(lines)
 

@@ -45,6 +45,7 @@ def shape_figure(result: ShapeResult) -> "Figure":
 def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
     """Error against run time of every scheme on every scene (rows) and grid (columns); a curve runs over tolerances."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     problems = list(dict.fromkeys(row["problem"] for row in rows))
     schemes = list(dict.fromkeys(row["scheme"] for row in rows))
@@ -58,7 +59,10 @@ def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
                 ax.plot([r["seconds"] for r in some], [r["error"] for r in some], "osD^vPX"[k % 7] + "-", ms=4, label=scheme)
             ax.axhline(0.01, color="gray", lw=0.8, ls=":")
             ax.set(xscale="log", yscale="log", xlabel="run time (s)")
+            ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            ax.xaxis.set_major_formatter("{x:g}")
             ax.xaxis.set_minor_formatter("")
+            ax.tick_params(axis="x", labelsize=8)
             ax.set_title(f"{problem}, {cells} cells", loc="left", fontsize=9)
         line[0].set_ylabel("error / largest change")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8, frameon=False)

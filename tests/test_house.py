@@ -23,7 +23,7 @@ FLOORS = [
     {"sim"},
     {"task", "goals", "planner", "plain"},
     {"shaping", "files"},
-    {"workprec", "stability"},
+    {"workprec", "stability", "piles"},
     {"analysis"},
     {"render", "benchmark"},
     {"commands"},

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand import piles
 
 from .conftest import ANGLE, MU
 from .test_settling import DX, rough
@@ -207,72 +208,22 @@ def test_gradients_agree_with_differences(scheme, neighbours):
         assert float(jnp.sum(slope * way)) == pytest.approx(float(difference), rel=1e-4, abs=1e-5)
 
 
-def grow(n, deposits=40, base=None, radius=0.26):
-    """A pile grown at one cell from the volume of a cone with a toe of `radius` map sides: the map and that volume."""
-    volume = math.pi * MU * (radius * n) ** 3 / 3
-    scene = js.make_scene((n, n), 1.0, ANGLE, "isotropic")
-
-    def one(h, _):
-        s = js.settle(scene, h.at[n // 2, n // 2].add(volume / deposits))
-        return s.height, s.outcome
-
-    h, outcomes = jax.jit(lambda h: jax.lax.scan(one, h, None, length=deposits))(
-        jnp.zeros((n, n)) if base is None else jnp.asarray(base)
-    )
-    assert not outcomes.any()
-    return np.asarray(h), volume
-
-
-def cone_error(n):
-    h, volume = grow(n)
-    y, x = np.indices((n, n)) - n // 2
-    return np.abs(h - np.maximum(MU * (0.26 * n - np.hypot(x, y)), 0)).sum() / volume, h
-
-
 def test_an_isotropic_pile_converges_to_the_cone():
     sides = np.array([33, 65, 129])
-    errors, maps = zip(*(cone_error(n) for n in sides), strict=True)
+    errors, maps = zip(*(piles.cone(n) for n in sides), strict=True)
     assert errors[1] < 0.02
     assert -np.polyfit(np.log(sides), np.log(errors), 1)[0] > 0.9
-    # Slopes from a quarter to four fifths of the radius, by bilinear interpolation.
-    n, h = 129, maps[2]
-    r = np.arange(0.25, 0.8, 0.02) * 0.26 * n
-    for angle in np.arange(16) * math.pi / 8:
-        y, x = n // 2 + r * math.sin(angle), n // 2 + r * math.cos(angle)
-        i, j = np.floor(y).astype(int), np.floor(x).astype(int)
-        v, u = y - i, x - j
-        z = (1 - v) * ((1 - u) * h[i, j] + u * h[i, j + 1]) + v * ((1 - u) * h[i + 1, j] + u * h[i + 1, j + 1])
-        slope = -np.polyfit(r, z, 1)[0]
-        assert math.degrees(math.atan(slope)) == pytest.approx(29, abs=0.5)
+    assert np.abs(piles.slopes(maps[2]) - 29).max() < 0.5
 
 
 def test_an_isotropic_pile_on_a_slope():
-    """Height c above a plane of slope a: V = pi c^3 mu / (3 (mu^2 - a^2)^(3/2)), grown by small deposits: each collapses
-    uphill too."""
-    a, errors = 0.5 * MU, []
-    for n, deposits in ((33, 640), (65, 2560)):
-        plane = np.broadcast_to(a * np.arange(n), (n, n))
-        radius = 0.16
-        h, volume = grow(n, deposits, plane, radius)
-        c = (3 * volume * (MU**2 - a**2) ** 1.5 / (math.pi * MU)) ** (1 / 3)
-        i = np.arange(n) - n // 2
-        exact = np.maximum(plane, plane[0, n // 2] + c - MU * np.hypot(i[:, None], i[None, :]))
-        errors.append(np.abs(h - exact).sum() / volume)
+    errors = [piles.on_a_slope(33, 640), piles.on_a_slope(65, 2560)]
     assert errors[1] < 0.06
     assert errors[1] < 0.55 * errors[0]
 
 
 def test_an_isotropic_overfilled_table_drains_to_its_roof():
-    """h = mu times the distance to the edge, V = mu L^3 / 6."""
-    errors = []
-    for n in (24, 48):
-        scene = js.make_scene((n, n), 1 / n, ANGLE, "isotropic", edge=js.Draining())
-        s = js.settle(scene, np.full((n, n), 0.5), stop=js.UntilStill(1e-4))
-        js.check(s)
-        x = (np.arange(n) + 0.5) / n
-        near = np.minimum(x, 1 - x)
-        roof = MU * np.minimum(near[:, None], near[None, :])
-        errors.append(np.abs(np.asarray(s.height) - roof).sum() / roof.sum())
+    errors = [piles.table(n) for n in (24, 48)]
     assert errors[1] < 0.02
     assert errors[1] < 0.6 * errors[0]
 
