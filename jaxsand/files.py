@@ -76,6 +76,12 @@ def as_table(rows: list[dict[str, Any]], title: str) -> list[str]:
     wide = {n: max(10, len(n) + 2) for n in names}
     lines = [title.ljust(first) + "".join(n.replace("_", " ").rjust(wide[n]) for n in names)]
     for text, row in zip(texts, rows, strict=True):
-        figures = ("-" if row.get(n) is None else f"{row[n]:.4g}" for n in names)
+        figures = (_figure(row.get(n)) for n in names)
         lines.append(text.ljust(first) + "".join(f.rjust(wide[n]) for f, n in zip(figures, names, strict=True)))
     return lines
+
+
+def _figure(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "NO"
+    return "-" if value is None else f"{value:.4g}"

@@ -82,9 +82,9 @@ def settle_batch(
     height = as_batch(height)
     check_chunk(chunk)
     scene, _ = fit(scene, height[0])
-    rules = cast((scheme, stop, window), height.dtype)
-    program = partial(_batch_program(), scene, rules=rules)
-    return on_all_cores(lambda maps, chunk: program(maps, chunk=chunk), height, chunk)
+    scheme, stop, window = cast((scheme, stop, window), height.dtype)
+    program = _batch_program()
+    return on_all_cores(lambda maps, chunk: program(scene, maps, scheme, stop, window, chunk=chunk), height, chunk)
 
 
 def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
@@ -162,10 +162,12 @@ def _in_window(
 _settle = jax.jit(relax)
 
 
-def _chunks(scene: Scene, height: jax.Array, rules: Any, *, chunk: int) -> Settled:
-    scheme, stop, window = rules
+def relax_batch(
+    scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE, *, chunk: int
+) -> Settled:
+    """`relax` for a batch of maps [B, H, W], B a multiple of the chunk."""
     if isinstance(window, Window) or isinstance(scheme, Multilevel):
-        return lax.map(lambda h: relax(scene, h, *rules), height, batch_size=chunk)
+        return lax.map(lambda h: relax(scene, h, scheme, stop, window), height, batch_size=chunk)
     bed, (bound, interval) = prepare(scene), _groups(stop)
 
     def enter(h: jax.Array, lost: Lost) -> Sand:
@@ -178,4 +180,4 @@ def _chunks(scene: Scene, height: jax.Array, rules: Any, *, chunk: int) -> Settl
 
 @cache
 def _batch_program() -> Any:
-    return jax.jit(_chunks, static_argnames="chunk", compiler_options=wide_vectors())
+    return jax.jit(relax_batch, static_argnames="chunk", compiler_options=wide_vectors())

@@ -14,7 +14,7 @@ from jaxsand.push import SteppedPush, push_along
 from jaxsand.rules import Outcome, Stop, as_batch, check_chunk, check_rate, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.schemes import Scheme
-from jaxsand.settling import Settled, relax
+from jaxsand.settling import Settled, relax, relax_batch
 from jaxsand.swath import SwathPush, push_swath
 from jaxsand.tool import Pose
 
@@ -217,10 +217,12 @@ def _itself(height: jax.Array) -> jax.Array:
 def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, record: Any = None) -> tuple[Shaped, Any]:
     push, scheme, stop = rules
     pushed, frames = _PUSHES[type(push)](scene, height, path, push, record)
-    settled = relax(scene, pushed.height, scheme, stop)
-    outcome = settled.outcome | pushed.outcome
-    settled = replace(settled, outcome=outcome, drained=settled.drained + pushed.drained)
-    return Shaped(**vars(settled), pose=pushed.pose), frames
+    return _both(pushed, relax(scene, pushed.height, scheme, stop)), frames
+
+
+def _both(pushed: Pushed, settled: Settled) -> Shaped:
+    outcome, drained = settled.outcome | pushed.outcome, settled.drained + pushed.drained
+    return Shaped(**vars(replace(settled, outcome=outcome, drained=drained)), pose=pushed.pose)
 
 
 @jax.jit
@@ -238,7 +240,10 @@ def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: _Rules)
 
 
 def _step_chunks(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, *, chunk: int) -> Shaped:
-    return jax.lax.map(lambda pair: _follow(scene, *pair, rules)[0], (height, path), batch_size=chunk)
+    push, scheme, stop = rules
+    act_on = partial(_PUSHES[type(push)], scene, push=push)
+    pushed = jax.lax.map(lambda pair: act_on(*pair)[0], (height, path), batch_size=chunk)
+    return _both(pushed, relax_batch(scene, pushed.height, scheme, stop, chunk=chunk))
 
 
 @cache

@@ -132,21 +132,6 @@ def stability(
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as text."""
-    first = max(len(row["name"]) for row in rows)
-    figures = ("residual", "rounding", "volume_error", "overshoot", "sweeps", "seconds")
-    head = "".join(name.replace("_", " ").rjust(14) for name in figures)
-    lines = [f"{'':{first}}  {'dtype':8}  {'scheme':18} {'outcome':10}{head}  right"]
-    for row in rows:
-        text = "".join(f"{row[name]:14.3g}" for name in figures) + ("  yes" if row["right"] else "  NO")
-        lines.append(f"{row['name']:{first}}  {row['dtype']:8}  {row['scheme']:18} {row['outcome']:10}{text}")
-        if "largest_height" in row:
-            lines.append(f"  largest height {row['largest_height']:.3g} m, last steepest slope {row['steepest_slope']:.4g}")
-    wrong = sum(not row["right"] for row in rows)
-    return "\n".join([*lines, f"{len(rows)} rows, {wrong} of them wrong"])
-
-
 def _row(case: Case, dtype: str) -> dict[str, Any]:
     height = case.height.astype(dtype)
     others = True

@@ -123,7 +123,7 @@ def _sweep_out(  # noqa: PLR0915
     # Slices of the stroke, of a spacing or more each; a cell belongs to two of them.
     least, _ = corners(scene, job, pose)
     origin = jnp.maximum(-half, least)
-    count = math.ceil(math.hypot(*scene.grid.shape) / 2) + 2
+    count = math.ceil(math.hypot(*scene.grid.shape) / 4) + 2
     slices = jnp.arange(count, dtype=h.dtype)
     thick = jnp.maximum(dx, (end - origin) / (count - 1))
     place = origin + slices * thick

@@ -123,7 +123,8 @@ def work_precision(problems: tuple[Problem, ...], tell: Tell = lambda _: None, s
                     row["error"] = distance(height, end, start)
                     row["error_fine"] = distance(height, fine, start)
                     row["error_exact"] = distance(height, problem.exact(n), start) if problem.exact else None
-                    row["overshoot"] = max(0.0, float(height.max() - start.max()), float(start.min() - height.min()))
+                    least = start.min() if problem.edge is None else min(start.min(), float(problem.edge.level))
+                    row["overshoot"] = max(0.0, float(height.max() - start.max()), float(least - height.min()))
                     rows.append(row)
     return rows
 

@@ -3,11 +3,12 @@
 import pytest
 
 import jaxsand as js
-from jaxsand.stability import stability, table
+from jaxsand.files import as_table
+from jaxsand.stability import stability
 
 
 def wrong(rows):
-    return "\n" + table([row for row in rows if not row["right"]] or rows[:1])
+    return "\n" + "\n".join(as_table([row for row in rows if not row["right"]] or rows[:1], "wrong"))
 
 
 def test_hard_numbers():
