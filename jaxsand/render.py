@@ -45,7 +45,7 @@ def shape_figure(result: ShapeResult) -> "Figure":
 def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
     """Error against run time of every scheme on every scene (rows) and grid (columns); a curve runs over tolerances."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator
+    from matplotlib.ticker import FixedLocator
 
     problems = list(dict.fromkeys(row["problem"] for row in rows))
     schemes = list(dict.fromkeys(row["scheme"] for row in rows))
@@ -59,7 +59,7 @@ def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
                 ax.plot([r["seconds"] for r in some], [r["error"] for r in some], "osD^vPX"[k % 7] + "-", ms=4, label=scheme)
             ax.axhline(0.01, color="gray", lw=0.8, ls=":")
             ax.set(xscale="log", yscale="log", xlabel="run time (s)")
-            ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            ax.xaxis.set_major_locator(FixedLocator([m * 10.0**k for k in range(-6, 4) for m in (1, 2, 5)]))
             ax.xaxis.set_major_formatter("{x:g}")
             ax.xaxis.set_minor_formatter("")
             ax.tick_params(axis="x", labelsize=8)

@@ -171,7 +171,7 @@ def _runs(problem: Problem, n: int, scheme: Scheme) -> list[dict[str, Any]]:
     rows = []
     for tolerance in _TOLERANCES:
         best, spent, turns = math.inf, 0.0, 0
-        while turns < 1 or (turns < 15 and spent < 0.3):
+        while turns < 2 or (turns < 15 and spent < 0.3):
             began = time.perf_counter()
             settled = jax.block_until_ready(compiled(start, jnp.float32(tolerance)))
             seconds = time.perf_counter() - began
