@@ -39,7 +39,7 @@ def sweeps_against_rate(n: int = 32) -> list[dict[str, Any]]:
     rows = []
     with jax.enable_x64(True):
         for dimensions, height, rates in (
-            (1, 8 * RIDGE.heights(n), np.linspace(0.05, 0.55, 11)),
+            (1, 8 * RIDGE.heights(n), np.append(np.linspace(0.05, 0.55, 11), [0.6, 0.7, 0.8])),
             (
                 2,
                 4 * COLUMN.heights(n),

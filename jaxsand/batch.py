@@ -84,9 +84,13 @@ def _together(
     return jax.vmap(judge)(height, sand, taken * march.interval), sand[1], taken, ready
 
 
-def on_all_cores(run: Callable[..., Tree], batch: Tree, chunk: int | None) -> Tree:
-    """`run(batch, chunk=...)` on every core: the batch [B, ...] is cut into as many parts, of chunks of one size."""
+def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int | None) -> Tree:
+    """`run(others, batch, chunk=...)` on every core: the batch [B, ...] is cut into as many parts, of chunks of one size."""
     leaves = jax.tree.leaves(batch)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((batch, others))):
+        raise ValueError(
+            "settle_batch and step_batch are outermost programs: inside jit, grad or vmap use jax.vmap of settle or step"
+        )
     total = leaves[0].shape[0]
     if chunk is None:
         chunk = max(1, _CELLS // math.prod(leaves[0].shape[1:])) if _on_cpu() else total
@@ -98,13 +102,13 @@ def on_all_cores(run: Callable[..., Tree], batch: Tree, chunk: int | None) -> Tr
     if extra:
         batch = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], extra, axis=0)]), batch)
     if threads == 1:
-        out = run(batch, chunk=width)
+        out = run(others, batch, chunk=width)
     else:
         x64 = jnp.result_type(float) == jnp.float64  # which may hold for this thread alone
 
         def part(one: Tree) -> Tree:
             with jax.enable_x64(x64):
-                return jax.block_until_ready(run(one, chunk=width))
+                return jax.block_until_ready(run(others, one, chunk=width))
 
         size = (total + extra) // threads
         parts = [jax.tree.map(lambda x, i=i: x[i * size : (i + 1) * size], batch) for i in range(threads)]

@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.scene import Scene, check_window, concrete
+from jaxsand.scene import Scene, as_array, check_window, concrete
 from jaxsand.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
 from jaxsand.window import Whole, Window
+
+_MOST = 1_000_000_000  # sweeps, which are counted in 32 bits
 
 
 class Outcome(IntFlag):
@@ -28,7 +30,8 @@ class Outcome(IntFlag):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class UntilStill:
-    """Sweep until no slope (a tangent) exceeds repose by more than `tolerance`, at most `bound` sweeps.
+    """Sweep until no slope (a tangent) exceeds repose by more than `tolerance`, at most `bound` sweeps (`Multilevel`: on
+    every grid, down and up).
 
     Looks every `interval` sweeps, so that the number of sweeps is a multiple of it (and 0 on a map that is still). Where the
     floats are too coarse to move sand down to the tolerance (large offsets in float32), it stops when nothing moves any more
@@ -59,13 +62,14 @@ def check_rule(scene: Scene, scheme: Scheme | None, stop: Stop | None) -> tuple[
     _check_scheme(scene, scheme)
     if isinstance(stop, UntilStill):
         for name, count in (("bound", stop.bound), ("interval", stop.interval)):
-            check_whole(f"stop.{name}", count, 1)
+            check_whole(f"stop.{name}", count, 1, _MOST)
     elif isinstance(stop, Sweeps):
-        check_whole("stop.count", stop.count, 0)
+        check_whole("stop.count", stop.count, 0, _MOST)
         if isinstance(scheme, Multilevel):
             raise ValueError("stop: got Sweeps with Multilevel, which settles until still; give UntilStill()")
     else:
         raise ValueError(f"stop: got {stop!r}; give UntilStill() or Sweeps(count)")
+    _check_number("stop.tolerance", stop.tolerance)
     tolerance = concrete(stop.tolerance)
     if tolerance is not None and not ((tolerance >= 0) & (tolerance < float("inf"))).all():
         raise ValueError(f"stop.tolerance: got {stop.tolerance!r}; give a slope of 0 or more, such as 1e-3")
@@ -76,6 +80,7 @@ def _check_scheme(scene: Scene, scheme: Scheme) -> None:
     if isinstance(scheme, Relaxation):
         check_rate(scene, "scheme.rate", scheme.rate)
     elif isinstance(scheme, Pairwise):
+        _check_number("scheme.share", scheme.share)
         share = concrete(scheme.share)
         if share is not None and not ((share > 0) & (share <= 1)).all():
             raise ValueError(f"scheme.share: got {scheme.share!r}; give a share above 0 and up to 1")
@@ -83,11 +88,11 @@ def _check_scheme(scene: Scene, scheme: Scheme) -> None:
             raise ValueError("scheme: got Pairwise with isotropic sand, which does not flow in pairs; use 4 or 8 neighbours")
     elif isinstance(scheme, SuperTimeStepping | Multilevel):
         for name, value, most in (("growth", scheme.growth, 4), ("first", scheme.first, 1), ("safety", scheme.safety, 1)):
-            if not 0 < value <= most:
-                raise ValueError(f"scheme.{name}: got {value!r}; give a number above 0 and up to {most}")
+            if not (isinstance(value, int | float) and 1e-4 <= value <= most):
+                raise ValueError(f"scheme.{name}: got {value!r}; give a number from 1e-4 to {most}")
         if isinstance(scheme, Multilevel):
             check_whole("scheme.coarsest", scheme.coarsest, 2)
-            if not 1 <= scheme.handover < float("inf"):
+            if not (isinstance(scheme.handover, int | float) and 1 <= scheme.handover < float("inf")):
                 raise ValueError(f"scheme.handover: got {scheme.handover!r}; give a time of at least 1, such as 128")
     else:
         raise ValueError(f"scheme: got {scheme!r}; give Relaxation, Pairwise, SuperTimeStepping or Multilevel")
@@ -104,6 +109,7 @@ def check_settling_window(scene: Scene, scheme: Scheme, window: Any) -> Whole | 
 
 def check_rate(scene: Scene, name: str, value: jax.typing.ArrayLike) -> None:
     """Raises ValueError unless a rate is positive and in the scene's stable range."""
+    _check_number(name, value)
     rate = concrete(value)
     limit = stable_rate(scene)
     if rate is not None and not (rate > 0).all():
@@ -114,7 +120,7 @@ def check_rate(scene: Scene, name: str, value: jax.typing.ArrayLike) -> None:
 
 def as_batch(height: jax.typing.ArrayLike) -> jax.Array:
     """The height as an array, if it is a batch [B, H, W]."""
-    height = jnp.asarray(height)
+    height = as_array("height", height)
     if height.ndim != 3 or not height.shape[0]:
         raise ValueError(f"height: got shape {list(height.shape)}; give a batch of at least one map [B, H, W]")
     return height
@@ -126,7 +132,18 @@ def check_chunk(chunk: int | None) -> None:
         check_whole("chunk", chunk, 1)
 
 
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Raises ValueError unless the value is a whole number of at least `least`."""
+def check_whole(name: str, value: Any, least: int, most: int | None = None) -> None:
+    """Raises ValueError unless the value is a whole number from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: got {value!r}; give a whole number of at least {least}")
+    if most is not None and value > most:
+        raise ValueError(f"{name}: got {value!r}; give at most {most:,}")
+
+
+def _check_number(name: str, value: Any) -> None:
+    try:
+        single = jnp.ndim(value) == 0 and jnp.issubdtype(jnp.result_type(value), jnp.number)
+    except TypeError:
+        single = False
+    if not single:
+        raise ValueError(f"{name}: got {value!r}; give one number, and use jax.vmap for several")

@@ -92,9 +92,14 @@ def fit(scene: Scene, height: jax.typing.ArrayLike) -> tuple[Scene, jax.Array]:
         rows, columns = scene.grid.shape
         remedy = "use jax.vmap" if height.shape[-2:] == scene.grid.shape else f"give a map of shape [{rows}, {columns}]"
         raise ValueError(f"height: got shape {list(height.shape)}, the scene has [{rows}, {columns}]; {remedy}")
-    angle = concrete(scene.material.repose_angle)
+    angle, spacing = concrete(scene.material.repose_angle), concrete(scene.grid.spacing)
     if angle is not None and not np.all(np.tan(angle.astype(height.dtype)) > 0):
-        raise ValueError(f"repose_angle: got an angle of pi/2 in {height.dtype}; give a smaller one, or float64 heights")
+        which = "pi/2" if np.any(angle > 1) else "0"
+        raise ValueError(f"repose_angle: got an angle of {which} in {height.dtype}; give another, or float64 heights")
+    if spacing is not None and not np.all(spacing.astype(height.dtype) ** 2 > 0):
+        raise ValueError(
+            f"spacing: got {scene.grid.spacing!r}, whose square is 0 in {height.dtype}; give metres, such as 0.01"
+        )
     return cast(scene, height.dtype), height
 
 

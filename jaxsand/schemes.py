@@ -67,7 +67,8 @@ class SuperTimeStepping:
 class Multilevel:
     """Super-time-stepping that hands late times over to coarser grids, whose cells are twice as wide.
 
-    On every grid the flow runs until the time `handover` (in squared spacings of that grid); what then still moves is
+    On every grid the flow runs until the time `handover` (in squared spacings of that grid, as a sweep of rate 1 takes it on
+    by 1); what then still moves is
     smooth, and the next coarser grid carries it on, down to a grid of less than twice `coarsest` cells. What changed there
     is added to the finer grid, linearly between cells, and settles. The cost to a given error grows with the number of
     cells alone. First order in growth and first, and in the ratio of a coarse spacing to what has been smoothed, so that the

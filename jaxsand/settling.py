@@ -16,7 +16,7 @@ from jaxsand.march import March, Sand, march
 from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window
 from jaxsand.scene import Scene, cast, fit
 from jaxsand.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
-from jaxsand.window import Whole, Window, cut, edge_movement, origin, paste
+from jaxsand.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
 
 _WHOLE = Whole()
 
@@ -44,12 +44,15 @@ def settle(
 ) -> Settled:
     """Lets a map [H, W] (m) settle to its angle of repose. One map; batch with `jax.vmap` or `settle_batch`.
 
-    Conserves volume up to what sweep.py says of rounding, keeps the map within its lowest and highest point at the rates
-    that `Relaxation` names, commutes with adding a constant, with h -> -h, mirrors and quarter turns, and leaves a settled
-    map as it is, to the last bit.
-    With a `window` it settles a block of that size around what is too steep. When nothing within two cells of the block's
-    edge (where that is not the map's) ends more than the window's tolerance, in spacings, from where it began, and the rest
-    was still, that is what settling everywhere gives; else the outcome says WINDOW_EDGE or NOT_STILL.
+    Conserves volume up to what bed.py says of rounding, leaves a settled map as it is to the last bit, and commutes with
+    h -> -h, with mirrors and quarter turns (to rounding for isotropic sand and on coarse grids; not `Pairwise`) and, up to
+    the floats' spacing, with adding a constant. What else holds is said of each scheme.
+
+    With a `window` it settles a block of that size around what is too steep. The outcome says WINDOW_EDGE if a slope
+    outside exceeds repose by more than the window's tolerance, or a cell within two cells of the block's edge (where that is
+    not the map's) ends more than the tolerance, in spacings, from where it began. With tolerance 0 and no such outcome the
+    map is the one that settling everywhere gives; with a tolerance it may also differ by what sand moves that is still to
+    that tolerance.
 
     Computes in the height's dtype. Differentiable in the height and the angle of repose, by what `stop` says of itself.
 
@@ -84,7 +87,7 @@ def settle_batch(
     scene, _ = fit(scene, height[0])
     scheme, stop, window = cast((scheme, stop, window), height.dtype)
     program = _batch_program()
-    return on_all_cores(lambda maps, chunk: program(scene, maps, scheme, stop, window, chunk=chunk), height, chunk)
+    return on_all_cores(program, (scene, scheme, stop, window), height, chunk)
 
 
 def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
@@ -147,25 +150,26 @@ def _groups(stop: Stop) -> tuple[int, int]:
 def _in_window(
     scene: Scene, bed: Bed, window: Window, scheme: Scheme, stop: Stop, sand: Sand
 ) -> tuple[Sand, jax.Array, jax.Array]:
-    """`_run` on the block around what is too steep; also whether sand came within two cells of the block's edge."""
+    """`_run` on the block around what is too steep; also whether sand moves outside or came within two cells of its edge."""
     u, lost = sand
     shape, h = scene.grid.shape, at(u)
     begin = origin(window, shape, middle(bed, u, jnp.asarray(stop.tolerance)))
     block, block_lost = cut(window, shape, begin, (h, lost))
+    outside = paste(begin, h, jnp.where(near_edge(window, shape, begin), block, jnp.nan))
+    restless = worst_excess(bed, halo(outside)) > window.tolerance
     here = replace(cut(window, shape, begin, bed), elsewhere=largest(paste(begin, h, jnp.zeros_like(block))))
     (after, block_lost), sweeps = _run(scene, here, scheme, stop, (halo(block), block_lost))
     change = edge_movement(window, shape, begin, block, at(after), jnp.zeros_like(block))
-    touched = change > window.tolerance * bed.spacing
+    touched = restless | (change > window.tolerance * bed.spacing)
     return (halo(paste(begin, h, at(after))), paste(begin, lost, block_lost)), sweeps, touched
 
 
 _settle = jax.jit(relax)
 
 
-def relax_batch(
-    scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE, *, chunk: int
-) -> Settled:
+def relax_batch(rules: tuple[Scene, Scheme, Stop, Whole | Window], height: jax.Array, *, chunk: int) -> Settled:
     """`relax` for a batch of maps [B, H, W], B a multiple of the chunk."""
+    scene, scheme, stop, window = rules
     if isinstance(window, Window) or isinstance(scheme, Multilevel):
         return lax.map(lambda h: relax(scene, h, scheme, stop, window), height, batch_size=chunk)
     bed, (bound, interval) = prepare(scene), _groups(stop)

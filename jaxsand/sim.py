@@ -5,7 +5,6 @@ from functools import cache, partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.batch import on_all_cores, wide_vectors
@@ -17,6 +16,7 @@ from jaxsand.schemes import Scheme
 from jaxsand.settling import Settled, relax, relax_batch
 from jaxsand.swath import SwathPush, push_swath
 from jaxsand.tool import Pose
+from jaxsand.window import Whole
 
 Push = SteppedPush | SwathPush
 _PUSHES: dict[type, Any] = {SteppedPush: push_along, SwathPush: push_swath}
@@ -110,7 +110,7 @@ def rollout(
 ) -> Shaped:
     """Pushes one after the other: `strokes` [n, 4] (m). Every field of the result gains a leading axis of length n."""
     scene, height, rules = _ready(scene, height, push, scheme, stop)
-    strokes = jnp.asarray(strokes, height.dtype)
+    strokes = as_array("strokes", strokes, height.dtype)
     if strokes.ndim != 2 or strokes.shape[1] != 4:
         raise ValueError(f"strokes: got shape {list(strokes.shape)}; give [n, 4], a row x0, y0, x1, y1 for each push")
     return _rollout(scene, height, strokes, rules)
@@ -131,13 +131,12 @@ def step_batch(
     Like `settle_batch`, it takes the maps in chunks and is an outermost program.
     """
     height = as_batch(height)
-    stroke = jnp.asarray(stroke, height.dtype)
+    stroke = as_array("stroke", stroke, height.dtype)
     if stroke.shape != (height.shape[0], 4):
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; give [{height.shape[0]}, 4], one stroke for each map")
     check_chunk(chunk)
     scene, _, rules = _ready(scene, height[0], push, scheme, stop)
-    program = partial(_step_program(), scene, rules=rules)
-    return on_all_cores(lambda some, chunk: program(*some, chunk=chunk), (height, stroke.reshape(-1, 2, 2)), chunk)
+    return on_all_cores(_step_program(), (scene, rules), (height, stroke.reshape(-1, 2, 2)), chunk)
 
 
 class OutcomeError(RuntimeError):
@@ -239,11 +238,11 @@ def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: _Rules)
     return jax.lax.scan(one, height, strokes)[1]
 
 
-def _step_chunks(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, *, chunk: int) -> Shaped:
-    push, scheme, stop = rules
+def _step_chunks(fixed: tuple[Scene, _Rules], maps_and_paths: tuple[jax.Array, jax.Array], *, chunk: int) -> Shaped:
+    scene, (push, scheme, stop) = fixed
     act_on = partial(_PUSHES[type(push)], scene, push=push)
-    pushed = jax.lax.map(lambda pair: act_on(*pair)[0], (height, path), batch_size=chunk)
-    return _both(pushed, relax_batch(scene, pushed.height, scheme, stop, chunk=chunk))
+    pushed = jax.lax.map(lambda pair: act_on(*pair)[0], maps_and_paths, batch_size=chunk)
+    return _both(pushed, relax_batch((scene, scheme, stop, Whole()), pushed.height, chunk=chunk))
 
 
 @cache

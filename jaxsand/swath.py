@@ -51,8 +51,10 @@ _ROOM = 0.25  # with less room than this part of a profile's own, sand is held b
 class SwathPush:
     """Trench, berms and heap of a whole leg at once, in closed form; a fast approximation of `SteppedPush`.
 
-    After each leg but the last the sand around the blade gets `sweeps` sweeps at `rate`. It works on the whole map, whatever
-    the scene's window.
+    For blades that cut between an eighth of a cell and a third of their width deep: there the settled map lies 20 to 40%
+    from the full push, in sum |h - h_ref| / sum |h_ref|; shallower and deeper ones lie farther. After each leg but the last
+    the sand around the blade gets `sweeps` sweeps at `rate`. It works on the whole map, whatever the scene's window, and its
+    memory grows with the cells times a quarter of those along the map's diagonal.
     """
 
     sweeps: int = field(default=8, metadata={"static": True})
@@ -95,7 +97,12 @@ def _sweep_out(  # noqa: PLR0915
     # Profiles, means over cells: of the berms, of the heap, of what leaves behind.
     area = jnp.sum(cover * sand)
     depth = jnp.sum(taken) / jnp.where(area > 0, area, 1)
-    mu = (jnp.mean(job.bed.drop) if job.bed.drop.ndim else job.bed.drop) / dx
+    drop = job.bed.drop
+    if drop.ndim:  # the mean of where the blade passes
+        weight = (cover + 1e-6 * under) * sand
+        all_of_it = jnp.sum(weight)
+        drop = jnp.where(all_of_it > 0, jnp.sum(weight * drop) / jnp.where(all_of_it > 0, all_of_it, 1), jnp.max(drop))
+    mu = drop / dx
     reach = jnp.sqrt(tool.width * jnp.maximum(depth, dx / 1000) / mu)
     lag = _LAG * (side + math.pi / 6 * reach)
     near, reach = jnp.maximum(_NEAR * reach, dx / 2), jnp.maximum(reach, dx / 2)

@@ -59,15 +59,20 @@ def paste(start: Origin, tree: Any, blocks: Any) -> Any:
     return jax.tree.map(lambda a, b: lax.dynamic_update_slice(a, b, start), tree, blocks)
 
 
+def near_edge(window: Window, shape: tuple[int, int], start: Origin) -> jax.Array:
+    """Which cells of the block lie within two cells of its edge where that is not the map's."""
+    near = []
+    for o, n, m in zip(start, window.size, shape, strict=True):
+        i = jnp.arange(n)
+        near.append(((i < 2) & (o > 0)) | ((i >= n - 2) & (o + n < m)))
+    return near[0][:, None] | near[1][None, :]
+
+
 def edge_movement(
     window: Window, shape: tuple[int, int], start: Origin, old: jax.Array, new: jax.Array, cover: jax.Array
 ) -> jax.Array:
     """The largest change of height within two cells of the block's edge where that is not the map's; infinite if the tool
     covers a part of it."""
-    near = []
-    for o, n, m in zip(start, window.size, shape, strict=True):
-        i = jnp.arange(n)
-        near.append(((i < 2) & (o > 0)) | ((i >= n - 2) & (o + n < m)))
     change = jnp.where(new == old, 0, jnp.abs(new - old))
     change = jnp.where(jnp.isnan(new), 0, jnp.where(cover > 0, jnp.inf, change))
-    return lax.stop_gradient(jnp.max(jnp.where(near[0][:, None] | near[1][None, :], change, 0)))
+    return lax.stop_gradient(jnp.max(jnp.where(near_edge(window, shape, start), change, 0)))

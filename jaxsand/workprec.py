@@ -190,14 +190,13 @@ def _runs(problem: Problem, n: int, scheme: Scheme) -> list[dict[str, Any]]:
 
 
 def time_to(rows: list[dict[str, Any]], error: float = 0.01) -> list[dict[str, Any]]:
-    """For every problem, size and scheme the least time that came within the error, and how that compares with the paper's
-    sweep; None where no tolerance did."""
+    """For every problem, size and scheme the time to within the error, by the loosest tolerance from which on all are, and
+    how that compares with the paper's sweep; None where the tightest is not."""
     found: dict[tuple[str, int, str], dict[str, Any] | None] = {}
-    for row in rows:
+    for row in sorted(rows, key=lambda row: -row["tolerance"]):
         key = (row["problem"], row["cells"], row["scheme"])
         best = found.setdefault(key, None)
-        if row["error"] <= error and (best is None or row["seconds"] < best["seconds"]):
-            found[key] = row
+        found[key] = (best or row) if row["error"] <= error else None
     table = []
     for (problem, n, scheme), best in found.items():
         base = found.get((problem, n, _PAPER))

@@ -82,6 +82,15 @@ def test_threads_compute_in_the_callers_precision(monkeypatch):
         assert js.settle_batch(scene, maps("float64"), chunk=8).height.dtype == jnp.float64
 
 
+def test_inside_another_program_it_says_what_to_use():
+    scene, h = js.make_scene(SHAPE, DX, ANGLE), jnp.asarray(maps("float32"))
+    for call in (lambda h: js.settle_batch(scene, h), lambda h: js.settle_batch(scene, h, chunk=64)):
+        with pytest.raises(ValueError, match=r"outermost programs: .*use jax\.vmap"):
+            jax.jit(call)(h)
+    with pytest.raises(ValueError, match="outermost programs"):
+        jax.grad(lambda a: js.settle_batch(js.make_scene(SHAPE, DX, a), h).height.sum())(ANGLE)
+
+
 def test_an_error_comes_out_of_a_thread(monkeypatch):
     monkeypatch.setattr(batch, "cores", lambda: 2)
     with pytest.raises(ValueError, match="chunk"):

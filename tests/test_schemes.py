@@ -172,6 +172,8 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
         (js.SuperTimeStepping(safety=1.5), "safety"),
         (js.Multilevel(handover=0.1), "handover"),
         (js.Multilevel(coarsest=1), "coarsest"),
+        (js.SuperTimeStepping("a"), "growth"),
+        (js.Relaxation(np.full((9, 9), 0.1)), "scheme.rate"),
         ("fast", "scheme"),
     ],
 )

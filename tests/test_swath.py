@@ -79,6 +79,26 @@ def test_the_result_is_continuous_in_the_stroke(edge):
                 assert change.max() < 6 * step
 
 
+def test_angles_far_away_and_in_walls_do_not_matter():
+    angles = np.full(SHAPE, 0.5)
+    far = angles.copy()
+    far[:, 26:] = 1.5
+    stroke = (0.05, 0.1, 0.1, 0.1)
+    plain, other = (
+        js.act(js.make_scene(SHAPE, DX, a, tool=js.Blade()), level(), stroke, push=FAST).height for a in (angles, far)
+    )
+    assert np.abs(np.asarray(plain) - other).max() < 1e-8
+    walls = js.Walls(np.zeros(SHAPE, bool))
+    walls.solid[0, 0] = True
+    steep = angles.copy()
+    steep[0, 0] = 1.57
+    plain, other = (
+        js.act(js.make_scene(SHAPE, DX, a, tool=js.Blade(), walls=walls), level(), stroke, push=FAST).height
+        for a in (angles, steep)
+    )
+    assert np.array_equal(plain, other)
+
+
 WEIGHTS = np.random.default_rng(9).standard_normal(SHAPE)
 NAMES = ("stroke", "width", "thickness", "depth", "angle", "height")
 
