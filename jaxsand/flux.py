@@ -109,7 +109,7 @@ def worst_excess(bed: Bed, u: jax.Array, around: Nothing | Partial | None = None
     gate = None
     if isinstance(around, Partial):
         u, gate = halo(around.surface(at(u))), around.open
-    worst = jnp.max(_highest(_excesses(bed, gate, u)))
+    worst = _highest(_excesses(bed, gate, u))
     if bed.rim is not None:
         worst = jnp.maximum(worst, jnp.max(2 * _over(bed, bed.rim, at(u)) * (_draining_sides(bed.rim) > 0)))
     return worst / bed.spacing
@@ -131,15 +131,15 @@ def middle(bed: Bed, u: jax.Array, tolerance: jax.Array) -> tuple[jax.Array, jax
 
 def steepest(bed: Bed, u: jax.Array) -> jax.Array:
     """The steepest slope (a tangent) of a map with halo, as its neighbourhood measures slopes."""
-    return jnp.max(_highest(slope for slope, _ in _slopes(bed, u))) / bed.spacing
+    return _highest(slope for slope, _ in _slopes(bed, u)) / bed.spacing
 
 
 def _highest(maps: Iterable[jax.Array]) -> jax.Array:
-    """Cell by cell the highest of the maps, at least 0; NaN means no link."""
+    """The highest value in any of the maps, at least 0; NaN means no link."""
     worst: Any = 0.0
     for e in maps:
         worst = jnp.where(e > worst, e, worst)
-    return jnp.max(worst, axis=0)  # rows first: XLA vectorises that
+    return jnp.max(jnp.max(worst, axis=0))  # rows first: XLA vectorises that
 
 
 def ends(u: jax.Array, di: int, dj: int) -> tuple[jax.Array, jax.Array]:

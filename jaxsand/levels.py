@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.bed import Bed, at, halo, largest, nothing_lost, quantum, rim_of, truncate
+from jaxsand.bed import Bed, at, grain, halo, nothing_lost, rim_of, truncate
 from jaxsand.flux import Nothing, Partial
 from jaxsand.march import Sand, march, still
 from jaxsand.schemes import Multilevel, schedule
@@ -37,8 +37,8 @@ def descend(
     groups = int(ends[0]) // interval if ends.size else bound // interval
     sand, taken = march(bed, cells, early, tolerance, interval).run(groups, sand)
 
-    grain = quantum(largest(at(sand[0])))
-    wide_bed, wide_cells, wide = _widen(bed, cells, grain, at(sand[0]))
+    cut = grain(bed, sand[0])
+    wide_bed, wide_cells, wide = _widen(bed, cells, cut, at(sand[0]))
     begun = (halo(wide), nothing_lost(wide_bed, wide))
     # Stiller than asked for, lest rounding on the finer grid set the sand in motion everywhere.
     stiller = tolerance if level else tolerance / 2
@@ -46,7 +46,7 @@ def descend(
     early_end = still(bed, cells, (tolerance, 2 / (scheme.safety * limit * bed.spacing)), sand[0])
     change = jnp.where(jnp.isnan(wide) | early_end, 0, at(ended) - wide)
     u, gone = sand
-    u = halo(at(u) + _spread(cells, grain, change, at(u)))
+    u = halo(at(u) + _spread(cells, cut, change, at(u)))
     if gone is not None and lost is not None:
         gone = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), gone, lost)
     late = schedule(scheme.steps(), limit, bound, interval)
@@ -54,13 +54,13 @@ def descend(
     return sand, taken + again + jnp.where(early_end, 0, (more + 3) // 4)
 
 
-def _widen(bed: Bed, cells: Cells, grain: jax.Array, volume: jax.Array) -> tuple[Bed, Cells, jax.Array]:
+def _widen(bed: Bed, cells: Cells, cut: jax.Array, volume: jax.Array) -> tuple[Bed, Cells, jax.Array]:
     """The bed, the cells and the volume [H/2, W/2] of the next coarser grid."""
     wide = _sum(_quarters(volume)) / 4  # NaN where any of the four is: no sand passes through a wall
     wide_cells: Cells = cells
     if isinstance(cells, Partial):
         wide_cells = Partial(halo(_sum(_quarters(at(cells.open))) / 4, 0.0))
-    wide = truncate(wide / grain) * grain
+    wide = truncate(wide / cut) * cut
     drop = bed.drop * 2
     if bed.drop.ndim:
         rows, columns = bed.drop.shape
@@ -83,7 +83,7 @@ def _inject(x: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return jnp.repeat(jnp.repeat(x, 2, 0), 2, 1)[: shape[0], : shape[1]]
 
 
-def _spread(cells: Cells, grain: jax.Array, change: jax.Array, volume: jax.Array) -> jax.Array:
+def _spread(cells: Cells, cut: jax.Array, change: jax.Array, volume: jax.Array) -> jax.Array:
     """A change of coarse cells for the fine ones: in whole quanta of the same sum, linear where cells are whole."""
     rows, columns = volume.shape
     whole_cell = ~jnp.isnan(volume)
@@ -92,7 +92,7 @@ def _spread(cells: Cells, grain: jax.Array, change: jax.Array, volume: jax.Array
     else:
         parts = _quarters(at(cells.open))
         total = _sum(parts)
-        given = [truncate(4 * change * (p / total) / grain) * grain for p in parts]
+        given = [truncate(4 * change * (p / total) / cut) * cut for p in parts]
         rest, found = 4 * change - _sum(given), jnp.zeros(total.shape, bool)
         fullest = jnp.max(jnp.stack(parts), axis=0)
         for k, p in enumerate(parts):  # what rounding left over goes to the first of the fullest
@@ -108,7 +108,7 @@ def _spread(cells: Cells, grain: jax.Array, change: jax.Array, volume: jax.Array
         ok = lax.slice_in_dim(whole_cell, 0, fine.shape[axis] - 1, axis=axis)
         ok = ok & lax.slice_in_dim(whole_cell, 1, fine.shape[axis], axis=axis)
         odd = np.arange(fine.shape[axis] - 1) % 2 == 1
-        over = jnp.where(ok & (odd[:, None] if axis == 0 else odd[None, :]), truncate((b - a) / (4 * grain)) * grain, 0)
+        over = jnp.where(ok & (odd[:, None] if axis == 0 else odd[None, :]), truncate((b - a) / (4 * cut)) * cut, 0)
         nothing = jnp.zeros_like(lax.slice_in_dim(fine, 0, 1, axis=axis))
         fine = fine + lax.concatenate([over, nothing], axis) - lax.concatenate([nothing, over], axis)
     return fine

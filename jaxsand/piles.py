@@ -13,10 +13,10 @@ from jaxsand.rules import UntilStill
 from jaxsand.scene import make_scene
 from jaxsand.settling import settle
 from jaxsand.walls import Draining
+from jaxsand.workprec import MU, roof
 
 Tell = Callable[[str], None]
 ANGLE = math.radians(29)
-MU = math.tan(ANGLE)
 
 
 def grow(n: int, deposits: int, neighbours: Neighbours, radius: float, base: np.ndarray | None = None) -> tuple[Any, float]:
@@ -73,10 +73,8 @@ def table(n: int, neighbours: Neighbours = "isotropic") -> float:
     """The L1 error of an overfilled square table of side 1 that drains over its edge: h = mu times the distance to it."""
     scene = make_scene((n, n), 1 / n, ANGLE, neighbours, edge=Draining())
     s = settle(scene, jnp.full((n, n), 0.5), stop=UntilStill(1e-4))
-    x = (np.arange(n) + 0.5) / n
-    near = np.minimum(x, 1 - x)
-    roof = MU * np.minimum(near[:, None], near[None, :])
-    return float(np.abs(np.asarray(s.height) - roof).sum() / roof.sum())
+    exact = roof(n) / n
+    return float(np.abs(np.asarray(s.height) - exact).sum() / exact.sum())
 
 
 def piles(tell: Tell = lambda _: None, sizes: int = 4) -> list[dict[str, Any]]:

@@ -94,32 +94,18 @@ def _sweep_out(  # noqa: PLR0915
     taken = jnp.where(sand > 0, taken, 0)  # heights of whole cells throughout
     first = taken * (under / jnp.where(cover > 0, cover, 1)) if lowered else jnp.zeros_like(taken)
 
-    # Profiles, means over cells: of the berms, of the heap, of what leaves behind.
     area = jnp.sum(cover * sand)
-    depth = jnp.sum(taken) / jnp.where(area > 0, area, 1)
-    drop = job.bed.drop
-    if drop.ndim:  # the mean of where the blade passes
-        weight = (cover + 1e-6 * under) * sand
-        all_of_it = jnp.sum(weight)
-        drop = jnp.where(all_of_it > 0, jnp.sum(weight * drop) / jnp.where(all_of_it > 0, all_of_it, 1), jnp.max(drop))
-    mu = drop / dx
-    reach = jnp.sqrt(tool.width * jnp.maximum(depth, dx / 1000) / mu)
+    depth = jnp.maximum(jnp.sum(taken) / jnp.where(area > 0, area, 1), dx / 1000)
+    mu = _drop(job, (cover + 1e-6 * under) * sand) / dx
+    reach = jnp.sqrt(tool.width * depth / mu)
     lag = _LAG * (side + math.pi / 6 * reach)
     near, reach = jnp.maximum(_NEAR * reach, dx / 2), jnp.maximum(reach, dx / 2)
     s, n = local(pose, job.x, job.y)
     end = half + length
-    into = jnp.minimum(_INTO * reach / tool.width, 0.8)
-    inner = jnp.minimum(_INNER * reach, side)
-    berm = (
-        _wedge(jnp.abs(n) - side - _GAP * reach, near, dx) * (1 - into) / 2
-        + _wedge(jnp.abs(jnp.abs(n) - jnp.maximum(side - _DOWN * reach, 0)), inner, dx) * into / 2
-    ) * sand
+    berm = _berms(n, side, near, reach, dx) * sand
     heap = _wedge(s - end, _THROW * reach, dx) * _across(n, side, _FLARE * reach, dx) * sand
-    behind = (
-        _wedge(-half - s, jnp.maximum(jnp.sqrt(tool.thickness * jnp.maximum(depth, dx / 1000) / mu), dx / 2), dx)
-        * _across(n, side, 0.0, dx)
-        * sand
-    )
+    back_reach = jnp.maximum(jnp.sqrt(tool.thickness * depth / mu), dx / 2)
+    behind = _wedge(-half - s, back_reach, dx) * _across(n, side, 0.0, dx) * sand
     heap_width = (2 * side + _FLARE * reach) / dx
 
     # Where the blade is lowered, some sand leaves behind it and to its sides.
@@ -165,14 +151,29 @@ def _sweep_out(  # noqa: PLR0915
     kept = heaped - heap_density * (heap_room + heap_beyond)
     last = taken * (jnp.exp((jnp.minimum(s, end) - end) / lag) + 1e-6)
     put = whole(job, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1)))
-    stays = taken
     if lost is not None:
         every = jnp.sum(taken)
         gone = jnp.sum(density * beyond) + heap_density * heap_beyond
         over = whole(job, taken * (gone / jnp.where(every > 0, every, 1)))
-        lost = lose(job.flow.quantum, lost, over)
-        stays = taken - over
-    return h + _complete(job, stays, put), lost
+        lost, taken = lose(job.flow.quantum, lost, over), taken - over
+    return h + _complete(job, taken, put), lost
+
+
+def _drop(job: Job, weight: jax.Array) -> jax.Array:
+    """The largest stable step, its mean by weight where it differs from cell to cell."""
+    drop = job.bed.drop
+    if not drop.ndim:
+        return drop
+    total = jnp.sum(weight)
+    return jnp.where(total > 0, jnp.sum(weight * drop) / jnp.where(total > 0, total, 1), jnp.max(drop))
+
+
+def _berms(n: jax.Array, side: jax.Array, near: jax.Array, reach: jax.Array, dx: jax.Array) -> jax.Array:
+    """Both berms' profile across the stroke, with what has slid back into the trench."""
+    into = jnp.minimum(_INTO * reach / (2 * side), 0.8)
+    inner = jnp.minimum(_INNER * reach, side)
+    outside = _wedge(jnp.abs(n) - side - _GAP * reach, near, dx) * (1 - into) / 2
+    return outside + _wedge(jnp.abs(jnp.abs(n) - jnp.maximum(side - _DOWN * reach, 0)), inner, dx) * into / 2
 
 
 def _complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:

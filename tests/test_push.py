@@ -12,7 +12,7 @@ from jaxsand.grid import centres
 from jaxsand.task import volume_error
 from jaxsand.tool import coverage
 
-from .conftest import ANGLE, MU
+from .conftest import ANGLE, MU, turned
 
 DX = 0.005
 SHAPE = (64, 96)
@@ -164,13 +164,7 @@ def test_mirrors_and_quarter_turns(dtype):
     side = 48 * DX
     stroke = np.array([0.07, 0.09, 0.17, 0.13])
     h = np.asarray(js.step(sand, start, stroke).height)
-    x0, y0, x1, y1 = stroke
-    for turn, moved in (
-        (np.fliplr, (side - x0, y0, side - x1, y1)),
-        (np.flipud, (x0, side - y0, x1, side - y1)),
-        (np.transpose, (y0, x0, y1, x1)),
-        (np.rot90, (y0, side - x0, y1, side - x1)),
-    ):
+    for turn, moved in turned(stroke, side):
         assert np.allclose(js.step(sand, turn(start), moved).height, turn(h), atol=tolerance), turn
 
 

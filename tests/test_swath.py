@@ -10,7 +10,7 @@ import pytest
 import jaxsand as js
 from jaxsand.task import volume_error
 
-from .conftest import ANGLE
+from .conftest import ANGLE, turned
 
 SHAPE, DX = (32, 32), 0.01
 SIDE = SHAPE[0] * DX
@@ -58,13 +58,7 @@ def test_a_wide_trench_has_a_floor_berms_and_a_heap(dtype):
 def test_mirrors_and_quarter_turns(dtype):
     start, atol = np.asarray(rough(dtype)), 4e-6 if dtype == "float32" else 1e-12
     h = np.asarray(js.step(scene(), start, STROKE, push=FAST).height)
-    x0, y0, x1, y1 = STROKE
-    for turn, moved in (
-        (np.fliplr, (SIDE - x0, y0, SIDE - x1, y1)),
-        (np.flipud, (x0, SIDE - y0, x1, SIDE - y1)),
-        (np.transpose, (y0, x0, y1, x1)),
-        (np.rot90, (y0, SIDE - x0, y1, SIDE - x1)),
-    ):
+    for turn, moved in turned(STROKE, SIDE):
         assert np.allclose(js.step(scene(), turn(start), moved, push=FAST).height, turn(h), atol=atol), turn
 
 
