@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxsand.planner import Plan
 from jaxsand.shaping import ShapeResult
 
 if TYPE_CHECKING:
@@ -66,6 +67,44 @@ def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
             ax.set_title(f"{problem}, {cells} cells", loc="left", fontsize=9)
         line[0].set_ylabel("error / largest change")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
+def plan_figure(dig: np.ndarray, plan: Plan) -> "Figure":
+    """A map's cells and the path over them, coloured by its order and drawn to the right of where it goes, so that the way
+    there and the way back lie apart."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    rows, columns = dig.shape
+    side = 0.5 * min(1.0, 24 / max(rows, columns))
+    figure = Figure(figsize=(max(columns * side, 3) + 2, max(rows * side, 2.5) + 0.8), layout="constrained")
+    axes = figure.subplots()
+    axes.imshow(dig, cmap="Greys", vmin=0, vmax=6)
+    cells = np.array(plan.cells, float)[:, ::-1]
+    runs = np.diff(cells, axis=0)
+    lines = np.stack([cells[:-1], cells[1:]], 1) + 0.13 * np.stack([-runs[:, 1], runs[:, 0]], 1)[:, None]
+    # Each step is joined to the next, round corners and reversals.
+    joined = np.concatenate([lines[:-1, 1:], lines[1:, :1]], 1) if len(lines) else lines
+    for some, width in ((joined, 1.2), (lines, 2.4)):
+        order = LineCollection(list(some), cmap="viridis", linewidths=width)
+        order.set_array(np.arange(len(some)))
+        axes.add_collection(order)
+    middles = lines.mean(1)
+    axes.quiver(
+        *middles.T, runs[:, 0], -runs[:, 1], scale=2.2 * max(rows, columns), width=0.05 / max(rows, columns, 6), pivot="mid"
+    )
+    axes.plot(*cells[0], "o", color="black", ms=9 * side / 0.5, label="start")
+    axes.plot(*cells[-1], "s", color="black", ms=10 * side / 0.5, mfc="none", label="end")
+    if len(lines):
+        figure.colorbar(order, ax=axes, label="step", shrink=0.7)
+    proof = "proven shortest" if plan.optimal else f"at least {plan.lower_bound:g} are needed"
+    figure.suptitle(f"{plan.steps} steps, {proof}", fontsize=11)
+    axes.set(xlabel="column", ylabel="row")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     return figure
 
 

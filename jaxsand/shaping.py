@@ -62,7 +62,7 @@ class Target:
     drawn: bool
     depth: float
     optimal: bool | None = None  # whether the steps are proven fewest, and what is proven of them; plans only
-    lower_bound: int | None = None
+    lower_bound: float | None = None
 
     @property
     def footprint(self) -> tuple[float, float]:
@@ -132,11 +132,11 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
             "so there is nothing to dig; lower the goal, or dig less deep"
         )
     scene = make_scene(goal.shape, layout.spacing, tool=layout.blade)
-    paths, optimal, lower = [], True, 0
+    paths, optimal, lower = [], True, 0.0
     for piece in connected_pieces(dig):
         part = np.zeros_like(dig)
         part[tuple(np.array(sorted(piece)).T)] = True
-        found = plan(part, bound=20_000)
+        found = plan(part, seconds=10)
         path = task.cell_centre(np.array(found.cells), rows, layout.cell, 0, layout.spacing)
         paths.append(np.concatenate([path, path[-1:]]) if len(path) == 1 else path)
         optimal, lower = optimal and found.optimal, lower + found.lower_bound

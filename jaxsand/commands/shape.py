@@ -1,22 +1,18 @@
-"""What the commands do, once their arguments are read."""
+"""`jaxsand shape`: from a goal to the strokes that trench it, to the sand they leave."""
 
 import argparse
 import math
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxsand.commands.printing import plain_name, read_cell, show
 from jaxsand.files import as_json, existing, folder, progress, read_text, written
 
 if TYPE_CHECKING:
     import numpy as np
 
     from jaxsand.shaping import Layout, ShapeResult, Target
-
-
-SCHEMES = ("relaxation", "pairwise", "super-time-stepping", "multilevel")
 
 
 def run_shape(options: argparse.Namespace) -> None:
@@ -30,7 +26,7 @@ def run_shape(options: argparse.Namespace) -> None:
     target = _target(options)
     planned = time.perf_counter() - began
     surface = _surface(options, target)
-    out = folder(options.out or Path(f"shape-{_plain(options.goal)}"))
+    out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
     result = shape(target, surface, tell)
     tell("drawing")
     began = time.perf_counter()
@@ -46,7 +42,7 @@ def run_shape(options: argparse.Namespace) -> None:
     with written(files["result.json"]) as path:
         path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
-    _print(options, report, _summary)
+    show(options, report, _summary)
 
 
 def _report(result: "ShapeResult", total: float, planned: float, drawn: float, files: dict[str, Path]) -> dict[str, Any]:
@@ -106,7 +102,7 @@ def _target(options: argparse.Namespace) -> "Target":
                 raise ValueError(f"{option.replace('_', '-')}: has no effect with --method strokes; leave it out")
         letter = name.upper() if len(name) == 1 and name.isascii() and name.isalpha() else ""
         return shaping.glyph_target(goals.letter_strokes(letter) if letter else goals.text_strokes(name), name)
-    start = _cell(options.start)
+    start = read_cell(options.start)
     if len(name) == 1:
         dig, own = goals.letter_map(name.upper() if name.isascii() else name)
         return shaping.map_target(dig, start if options.start else own, name.upper(), _layout(options))
@@ -167,125 +163,3 @@ def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | Non
             f"surface: got shape {list(heights.shape)}, the scene has {list(target.scene.grid.shape)}; make them equal"
         )
     return heights
-
-
-def run_settle(options: argparse.Namespace) -> None:
-    tell = progress()
-    if options.out_file.suffix != ".npy":
-        raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")
-    from jaxsand import goals
-
-    heights = goals.read_heights(existing(options.input))
-    import jax
-    import numpy as np
-
-    if heights.dtype == np.float64:
-        jax.config.update("jax_enable_x64", True)
-    elif heights.dtype.kind != "f":
-        heights = heights.astype(np.float32)
-    from jaxsand import schemes
-    from jaxsand.rules import Outcome, UntilStill
-    from jaxsand.scene import make_scene
-    from jaxsand.settling import settle
-    from jaxsand.sim import OutcomeError, check
-    from jaxsand.task import volume_error
-
-    if not np.all(np.isfinite(heights)):
-        raise ValueError(f"{options.input}: got {np.sum(~np.isfinite(heights))} cells that are not finite; fill them first")
-    scene = make_scene(heights.shape, options.spacing, math.radians(options.repose_deg), options.neighbours)
-    scheme = getattr(schemes, options.scheme.title().replace("-", ""))()
-    stop = UntilStill(options.tol, bound=options.bound)
-    folder(options.out_file.parent)
-    tell("settling")
-    began = time.perf_counter()
-    compiled = jax.jit(lambda h: settle(scene, h, scheme=scheme, stop=stop)).lower(heights).compile()
-    ready = time.perf_counter()
-    settled = jax.block_until_ready(compiled(heights))
-    ran = time.perf_counter() - ready
-    with written(options.out_file) as path, path.open("wb") as file:
-        np.save(file, np.asarray(settled.height))
-    tell("")
-    outcome = Outcome(int(settled.outcome))
-    report = {
-        "sweeps": int(settled.sweeps),
-        "residual": float(settled.residual),
-        "volume_error": volume_error(heights, settled.height),
-        "outcome": "clean" if not outcome else (outcome.name or str(int(outcome))).lower(),
-        "seconds": ran + ready - began,
-        "seconds_compile": ready - began,
-        "seconds_run": ran,
-        "files": [str(options.out_file)],
-    }
-    if outcome:
-        try:
-            check(settled)
-        except OutcomeError as error:
-            print(f"warning: {error}", file=sys.stderr)
-    _print(options, report, _lines)
-
-
-def run_plan(options: argparse.Namespace) -> None:
-    from jaxsand import goals
-    from jaxsand.planner import plan
-
-    start = _cell(options.start)
-    own: tuple[int, int] | None
-    if len(options.map) == 1:
-        dig, own = goals.letter_map(options.map.upper() if options.map.isascii() else options.map)
-    else:
-        dig, own = goals.read_text_map(read_text(Path(options.map)), options.map)
-    began = time.perf_counter()
-    found = plan(dig, start if options.start else own)
-    report = {
-        "steps": found.steps,
-        "path": found.path,
-        "start": list(found.start),
-        "optimal": found.optimal,
-        "lower_bound": found.lower_bound,
-        "expanded": found.expanded,
-        "opened": found.opened,
-        "engine": "astar",
-        "seconds": time.perf_counter() - began,
-    }
-    _print(options, report, _lines)
-
-
-def run_benchmark(options: argparse.Namespace) -> None:
-    tell = progress()
-    out = folder(options.out) if options.out else None
-    from jaxsand.benchmark import bench, table
-
-    report = bench(options.what, options.batch, tell, options.grids)
-    if out:
-        if report.get("work_precision"):
-            from jaxsand.render import save_figure, work_precision_figure
-
-            with written(out / f"bench-{options.what}.png") as path:
-                save_figure(work_precision_figure(report["work_precision"]), path)
-        with written(out / f"bench-{options.what}.json") as path:
-            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
-    tell("")
-    _print(options, report, table)
-
-
-def _cell(text: str | None) -> tuple[int, int] | None:
-    if text is None or text == "best":
-        return None
-    try:
-        row, column = (int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"start: got {text!r}; give row,column such as 3,3, or best") from None
-    return row, column
-
-
-def _print(options: argparse.Namespace, report: dict[str, Any], human: Callable[[dict[str, Any]], str]) -> None:
-    print(as_json(report) if options.json else human(report))
-
-
-def _lines(report: dict[str, Any]) -> str:
-    return "\n".join(f"{name}: {value}" for name, value in report.items())
-
-
-def _plain(name: str) -> str:
-    stem = Path(name).stem if Path(name).suffix in (".txt", ".png", ".npy") else name
-    return "".join(c if c.isalnum() else "-" for c in stem)[:40]

@@ -1,0 +1,24 @@
+"""`jaxsand bench`: error against run time, and speed beside rivals."""
+
+import argparse
+
+from jaxsand.commands.printing import show
+from jaxsand.files import as_json, folder, progress, written
+
+
+def run_benchmark(options: argparse.Namespace) -> None:
+    tell = progress()
+    out = folder(options.out) if options.out else None
+    from jaxsand.benchmark import bench, table
+
+    report = bench(options.what, options.batch, tell, options.grids)
+    if out:
+        if report.get("work_precision"):
+            from jaxsand.render import save_figure, work_precision_figure
+
+            with written(out / f"bench-{options.what}.png") as path:
+                save_figure(work_precision_figure(report["work_precision"]), path)
+        with written(out / f"bench-{options.what}.json") as path:
+            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+    tell("")
+    show(options, report, table)

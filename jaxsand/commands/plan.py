@@ -1,0 +1,59 @@
+"""`jaxsand plan`: the shortest single stroke over a binary map."""
+
+import argparse
+import time
+from pathlib import Path
+
+from jaxsand.commands.printing import lines, plain_name, read_cell, show
+from jaxsand.files import as_json, folder, progress, read_text, written
+
+
+def run_plan(options: argparse.Namespace) -> None:
+    tell = progress()
+    from jaxsand import goals
+    from jaxsand.planner import plan
+
+    own: tuple[int, int] | None
+    if len(options.map) == 1:
+        dig, own = goals.letter_map(options.map.upper() if options.map.isascii() else options.map)
+    else:
+        dig, own = goals.read_text_map(read_text(Path(options.map)), options.map)
+    start = read_cell(options.start) if options.start else own
+    out = folder(options.out) if options.out else None
+    tell("planning")
+    began = time.perf_counter()
+    found = plan(
+        dig,
+        start,
+        end=read_cell(options.end, "end"),
+        turn_cost=options.turn_cost,
+        engine=options.engine,
+        weight=options.weight,
+        seconds=options.seconds,
+    )
+    report = {
+        "steps": found.steps,
+        "path": found.path,
+        "start": list(found.start),
+        **({"cost": found.cost} if options.turn_cost else {}),
+        "optimal": found.optimal,
+        "lower_bound": found.lower_bound,
+        "gap": found.gap,
+        "expanded": found.expanded,
+        "opened": found.opened,
+        "engine": found.engine,
+        "seconds": time.perf_counter() - began,
+    }
+    if out:
+        from jaxsand.render import plan_figure, save_figure
+
+        stem = plain_name(options.map)
+        files = [out / f"plan-{stem}.{suffix}" for suffix in ("png", "json")]
+        report["files"] = [str(file) for file in files]
+        tell("drawing")
+        with written(files[0]) as path:
+            save_figure(plan_figure(dig, found), path)
+        with written(files[1]) as path:
+            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+    tell("")
+    show(options, report, lines)

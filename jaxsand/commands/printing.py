@@ -1,0 +1,31 @@
+"""What all commands share: reading a cell, printing a report."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxsand.files import as_json
+
+
+def read_cell(text: str | None, field: str = "start") -> tuple[int, int] | None:
+    if text is None or text == "best":
+        return None
+    try:
+        row, column = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"{field}: got {text!r}; give row,column such as 3,3, or best") from None
+    return row, column
+
+
+def show(options: argparse.Namespace, report: dict[str, Any], human: Callable[[dict[str, Any]], str]) -> None:
+    print(as_json(report) if options.json else human(report))
+
+
+def lines(report: dict[str, Any]) -> str:
+    return "\n".join(f"{name}: {value}" for name, value in report.items())
+
+
+def plain_name(name: str) -> str:
+    stem = Path(name).stem if Path(name).suffix in (".txt", ".png", ".npy") else name
+    return "".join(c if c.isalnum() else "-" for c in stem)[:40]

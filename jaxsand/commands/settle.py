@@ -1,0 +1,66 @@
+"""`jaxsand settle`: a height map settles to its angle of repose."""
+
+import argparse
+import math
+import sys
+import time
+
+from jaxsand.commands.printing import lines, show
+from jaxsand.files import existing, folder, progress, written
+
+SCHEMES = ("relaxation", "pairwise", "super-time-stepping", "multilevel")
+
+
+def run_settle(options: argparse.Namespace) -> None:
+    tell = progress()
+    if options.out_file.suffix != ".npy":
+        raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")
+    from jaxsand import goals
+
+    heights = goals.read_heights(existing(options.input))
+    import jax
+    import numpy as np
+
+    if heights.dtype == np.float64:
+        jax.config.update("jax_enable_x64", True)
+    elif heights.dtype.kind != "f":
+        heights = heights.astype(np.float32)
+    from jaxsand import schemes
+    from jaxsand.rules import Outcome, UntilStill
+    from jaxsand.scene import make_scene
+    from jaxsand.settling import settle
+    from jaxsand.sim import OutcomeError, check
+    from jaxsand.task import volume_error
+
+    if not np.all(np.isfinite(heights)):
+        raise ValueError(f"{options.input}: got {np.sum(~np.isfinite(heights))} cells that are not finite; fill them first")
+    scene = make_scene(heights.shape, options.spacing, math.radians(options.repose_deg), options.neighbours)
+    scheme = getattr(schemes, options.scheme.title().replace("-", ""))()
+    stop = UntilStill(options.tol, bound=options.bound)
+    folder(options.out_file.parent)
+    tell("settling")
+    began = time.perf_counter()
+    compiled = jax.jit(lambda h: settle(scene, h, scheme=scheme, stop=stop)).lower(heights).compile()
+    ready = time.perf_counter()
+    settled = jax.block_until_ready(compiled(heights))
+    ran = time.perf_counter() - ready
+    with written(options.out_file) as path, path.open("wb") as file:
+        np.save(file, np.asarray(settled.height))
+    tell("")
+    outcome = Outcome(int(settled.outcome))
+    report = {
+        "sweeps": int(settled.sweeps),
+        "residual": float(settled.residual),
+        "volume_error": volume_error(heights, settled.height),
+        "outcome": "clean" if not outcome else (outcome.name or str(int(outcome))).lower(),
+        "seconds": ran + ready - began,
+        "seconds_compile": ready - began,
+        "seconds_run": ran,
+        "files": [str(options.out_file)],
+    }
+    if outcome:
+        try:
+            check(settled)
+        except OutcomeError as error:
+            print(f"warning: {error}", file=sys.stderr)
+    show(options, report, lines)

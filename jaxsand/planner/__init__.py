@@ -1,0 +1,96 @@
+"""Planning a single stroke: the shortest walk that digs every cell of a binary map and no other.
+
+The tool moves by one cell north, east, south or west and digs the cell it comes to. A cell dug by mistake cannot be mended,
+so the walk stays on the goal's cells (arXiv:1908.02745, "Single Stroke").
+"""
+
+import math
+from dataclasses import replace
+from typing import Any, Literal
+
+from jaxsand.planner.anytime import anytime, nearest_first, simple_bound
+from jaxsand.planner.astar import LARGEST, astar
+from jaxsand.planner.board import Board, Cell, Problem, connected_pieces, make_problem
+from jaxsand.planner.exact import exact
+from jaxsand.planner.paper import ALPHA, paper
+from jaxsand.planner.plans import Plan, as_plan
+
+__all__ = ["Board", "Cell", "Engine", "Plan", "Problem", "connected_pieces", "make_problem", "plan"]
+
+Engine = Literal["auto", "paper", "astar", "exact", "anytime"]
+_WIDTH = 16_384
+_UNLIMITED = 1 << 60
+
+
+def plan(
+    dig: Any,
+    start: Any = None,
+    *,
+    end: Cell | None = None,
+    turn_cost: float = 0,
+    engine: Engine = "auto",
+    weight: float | None = None,
+    bound: int | None = None,
+    seconds: float | None = None,
+) -> Plan:
+    """The shortest walk over the true cells of `dig` [rows, columns] (row 0 on top).
+
+    Args:
+      start: (row, column), or several such; without it, wherever is best.
+      end: where the walk must end; without it, anywhere.
+      turn_cost: what a change of heading costs, in steps; a reversal is one change.
+      engine: `auto` proves the best with the sweeps of `exact`, or with A* where turns cost, within some seconds; `exact`
+        goes on until it is proven; `astar` is A* with a proven bound, dead ends pruned; `paper` the search of
+        arXiv:1908.02745; `anytime` improves a first walk until `seconds` are over (10 if not given).
+      weight: by how much A* and the paper's search overrate what is left (1; above 1 is greedier and proves less; the
+        paper's alpha is 7.2 / weight).
+      bound: expansions after which they give up; then the walk goes on to the nearest cell to dig, and `optimal` is false
+        unless the lower bound was met. For `exact` and `auto`, how many states are kept at a time.
+      seconds: after which `anytime` stops; `auto` and `exact` with it do as `anytime` does.
+
+    Raises:
+      ValueError: for a map that is empty or falls into pieces (it names them), a start or an end that is not a cell to dig,
+        or an option that the engine does not have.
+    """
+    problem = make_problem(dig, start, end, turn_cost)
+    _check(problem, engine, weight, bound, seconds)
+    if engine == "auto" and seconds is not None:
+        engine = "anytime"
+    if engine == "auto":
+        engine = "exact"
+        if turn_cost:
+            engine = "astar" if len(problem.board.cells) <= LARGEST else "anytime"
+        bound = bound or (200_000 if turn_cost else _WIDTH)
+    match engine:
+        case "paper":
+            found = paper(problem, ALPHA / (weight or 1), bound or 2_000_000)
+        case "astar":
+            found = astar(problem, bound or 200_000, weight or 1)
+        case "exact":
+            found = anytime(problem, seconds) if seconds else exact(problem, bound or _UNLIMITED)
+        case "anytime":
+            found = anytime(problem, 10 if seconds is None else seconds)
+    lower = max(found.lower_bound, simple_bound(problem))
+    walk = found.walk if found.walk is not None else nearest_first(problem)
+    return as_plan(problem, replace(found, walk=walk, lower_bound=lower), engine)
+
+
+def _check(problem: Problem, engine: str, weight: float | None, bound: int | None, seconds: float | None) -> None:
+    engines = ("auto", "paper", "astar", "exact", "anytime")
+    if engine not in engines:
+        raise ValueError(f"engine: got {engine!r}; give one of {', '.join(engines)}")
+    for field, value, users in (
+        ("weight", weight, ("paper", "astar")),
+        ("bound", bound, ("auto", "paper", "astar", "exact")),
+        ("seconds", seconds, ("auto", "exact", "anytime")),
+    ):
+        if value is None:
+            continue
+        if engine not in users:
+            raise ValueError(f"{field}: has no effect with engine {engine!r}; leave it out, or use {' or '.join(users)}")
+        if not 0 < value < math.inf:
+            raise ValueError(f"{field}: got {value}; give a number above 0")
+    if problem.turn_cost and engine in ("paper", "exact"):
+        raise ValueError(f"turn_cost: {engine!r} does not know turns; use astar, anytime or auto")
+    if engine == "astar" and len(problem.board.cells) > LARGEST:
+        raise ValueError(f"map: got {len(problem.board.cells)} cells, too many for astar ({LARGEST}); use exact or anytime")
