@@ -27,6 +27,17 @@ PUBLISHED = {
 Map = tuple[np.ndarray, Cell | None]
 
 
+def planning(tell: Tell) -> dict[str, list[dict[str, Any]]]:
+    """All tables."""
+    return {
+        "paper_counts": rows_of_paper(tell),
+        "plan_letters": rows_of_letters(tell),
+        "plan_by_alpha": rows_of_alpha(tell),
+        "plan_by_size": rows_of_size(tell),
+        "plan_large": rows_of_hard(tell),
+    }
+
+
 def stretched(letter: str, times: int) -> Map:
     """A letter's map with every step made `times` as long, still one cell wide."""
     dig, start = goals.letter_map(letter)

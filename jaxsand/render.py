@@ -108,6 +108,45 @@ def plan_figure(dig: np.ndarray, plan: Plan) -> "Figure":
     return figure
 
 
+def complexity_figure(report: dict[str, Any]) -> "Figure":
+    """Expansions and time of planning against back-tracks and size, and the paper's search at falling alpha."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    axes = figure.subplots(2, 3)
+    sizes = report["plan_by_size"]
+    families = {"combs of 28 cells": "comb", "letter T, stretched": "T,", "letter A, stretched": "A,"}
+    for column, (title, start) in enumerate(families.items()):
+        some = [row for row in sizes if row["name"].startswith(start)]
+        for line, unit, label in ((0, "expanded", "states expanded"), (1, "ms", "time (ms)")):
+            ax = axes[line, column]
+            for engine, mark in (("paper", "s-"), ("astar", "o-"), ("exact", "^-")):
+                points = [(row["x"], row[f"{engine}_{unit}"]) for row in some if row[f"{engine}_{unit}"]]
+                if points:
+                    ax.plot(*zip(*points, strict=True), mark, ms=4, label=engine)
+            ax.set(yscale="log", xlabel="teeth" if start == "comb" else "times as long", ylabel=label)
+            ax.set_title(title, loc="left", fontsize=10)
+    axes[1, 0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def alpha_figure(report: dict[str, Any]) -> "Figure":
+    """Nodes that the paper's search opens at falling alpha, and the steps in excess of the fewest."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for k, letter in enumerate("ASTR"):
+        some = [row for row in report["plan_by_alpha"] if row["name"] == letter]
+        alphas = [row["alpha"] for row in some]
+        left.plot(alphas, [row["nodes"] for row in some], "osD^"[k] + "-", ms=4, label=letter)
+        right.plot(alphas, [row["steps_in_excess"] + 0.04 * k for row in some], "osD^"[k] + "-", ms=4, label=letter)
+    left.set(yscale="log", xlabel="alpha", ylabel="nodes opened")
+    right.set(xlabel="alpha", ylabel="steps in excess of the fewest")
+    left.legend(frameon=False, fontsize=8)
+    return figure
+
+
 def save_figure(figure: "Figure", path: Path) -> None:
     """Writes a PNG."""
     figure.savefig(path, dpi=110, format="png")

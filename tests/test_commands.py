@@ -94,6 +94,11 @@ BAD = {
     "unwritable folder": (["settle", "pile.npy", "--out-file", "a-file/x.npy"], "out: cannot write to a-file"),
     "plan of nothing": (["plan", "none.txt"], "none.txt: no such file"),
     "plan in pieces": (["plan", "apart.txt"], "map: got 2 pieces"),
+    "plan to nowhere": (["plan", "l.txt", "--end", "0,2"], r"end: got \(0, 2\)"),
+    "plan to no cell": (["plan", "l.txt", "--end", "here"], "end: got 'here'"),
+    "plan in no time": (["plan", "l.txt", "--seconds", "0"], "seconds: got 0.0"),
+    "weight of nothing": (["plan", "l.txt", "--weight", "2"], "weight: has no effect with engine 'auto'"),
+    "turns beyond price": (["plan", "l.txt", "--turn-cost", "inf"], "turn_cost: got inf"),
     "unknown benchmark": (["bench", "everything"], "what: invalid choice"),
     "batch of none": (["bench", "settle", "--batch", "0"], "batch: got '0'"),
 }
@@ -178,6 +183,27 @@ def test_plan(here, capsys):
     assert (report["path"], report["steps"], report["optimal"], report["lower_bound"]) == ("SSEE", 4, True, 4)
     assert main(["plan", "S"]) == 0
     assert "steps: 27" in capsys.readouterr().out
+
+
+def test_plan_by_every_engine(here, capsys):
+    for engine in ("auto", "paper", "astar", "exact", "anytime"):
+        assert main(["plan", "T", "--engine", engine, "--json"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert (report["steps"], report["optimal"], report["gap"]) == (18, True, 0)
+    assert main(["plan", "T", "--engine", "paper", "--weight", "2.4", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["steps"], report["opened"], report["optimal"], report["engine"]) == (21, 820, False, "paper")
+
+
+def test_plan_with_an_end_turns_and_a_picture(here, capsys):
+    assert main(["plan", "A", "--end", "0,1", "--turn-cost", "0.5", "--seconds", "5", "--out", "plans", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["optimal"]
+    assert report["cost"] > report["steps"] >= 29
+    picture, data = (here / file for file in report["files"])
+    with Image.open(picture) as image:
+        assert image.size[0] > 200
+    assert json.loads(data.read_text())["path"] == report["path"]
 
 
 @pytest.mark.parametrize("goal", ["white-S.png", "dip.npy", "terrain", "7"])

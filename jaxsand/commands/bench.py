@@ -13,11 +13,16 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
     report = bench(options.what, options.batch, tell, options.grids)
     if out:
-        if report.get("work_precision"):
-            from jaxsand.render import save_figure, work_precision_figure
+        from jaxsand.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
 
+        if report.get("work_precision"):
             with written(out / f"bench-{options.what}.png") as path:
                 save_figure(work_precision_figure(report["work_precision"]), path)
+        if "plan_by_size" in report:
+            with written(out / "bench-plan.png") as path:
+                save_figure(complexity_figure(report), path)
+            with written(out / "bench-plan-alpha.png") as path:
+                save_figure(alpha_figure(report), path)
         with written(out / f"bench-{options.what}.json") as path:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
