@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
     p.add_argument("--end", metavar="R,C", help="cell where the stroke must end (anywhere)")
     p.add_argument("--turn-cost", type=_number, default=0.0, metavar="C", help="steps that a change of heading costs (0)")
-    p.add_argument("--engine", choices=["auto", "paper", "astar", "exact", "anytime"], default="auto")
+    p.add_argument("--engine", choices=["auto", "paper", "astar", "exact", "anytime", "frontier"], default="auto")
     p.add_argument("--weight", type=_number, metavar="W", help="how much astar and paper overrate what is left (1)")
     p.add_argument("--seconds", type=_number, metavar="S", help="time for anytime (10); with auto, use anytime")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for a picture of the path, and the report")

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import analysis, complexity, goals, piles, stability, workprec
+from jaxsand import analysis, complexity, expansions, goals, piles, stability, workprec
 from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
@@ -70,6 +70,7 @@ def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int 
             report["push_by_spacing"] = analysis.push_against_spacing(tell)
     if what in ("plan", "all"):
         report |= complexity.planning(tell)
+        report["expansions"] = expansions.rows_of_expansions(tell)
     if what == "stability":
         report["stability"] = stability.stability(tell=tell)
     if what == "letters":

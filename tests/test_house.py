@@ -23,7 +23,7 @@ FLOORS = [
     {"sim"},
     {"task", "goals", "planner", "plain"},
     {"shaping", "files"},
-    {"workprec", "stability", "complexity"},
+    {"workprec", "stability", "complexity", "expansions"},
     {"analysis", "piles"},
     {"render", "benchmark"},
     {"commands"},
@@ -31,8 +31,8 @@ FLOORS = [
 ]
 INSIDE = {
     "planner": [
-        {"board"},
-        {"bound", "order", "plans", "relaxed"},
+        {"board", "graph"},
+        {"bound", "order", "plans", "relaxed", "frontier"},
         {"astar", "paper", "sweepline"},
         {"exact"},
         {"anytime"},

@@ -267,6 +267,17 @@ def test_blocks_share_no_edge_and_meet_in_cut_cells():
     assert sum(len(b.cells) - 1 for b in blocks) == len(board.cells) - 1  # a tree of blocks
 
 
+def test_whole_layers_are_an_engine_too():
+    dig, start = letter_map("P")
+    found = js.plan(dig, start, engine="frontier")
+    assert (found.steps, found.optimal, found.engine) == (17, True, "frontier")
+    assert set(replay(start, found.path)) == {tuple(c) for c in np.argwhere(dig)}
+    dig, start = complexity.thickened("A", 2)
+    stopped = js.plan(dig, start, engine="frontier", bound=500)
+    assert stopped.expanded == 500
+    assert stopped.lower_bound <= js.plan(dig, start).steps <= stopped.steps
+
+
 def test_one_cell():
     for engine in (*ENGINES, "auto", "paper"):
         found = js.plan(np.array([[True]]), engine=engine)
@@ -287,6 +298,7 @@ def test_one_cell():
         (np.ones(4, bool), {}, r"map: got bool of shape \[4\]"),
         (np.ones((2, 2), bool), {"turn_cost": -1}, "turn_cost: got -1"),
         (np.ones((2, 2), bool), {"turn_cost": 1, "engine": "exact"}, "turn_cost: 'exact' does not know turns"),
+        (np.ones((2, 2), bool), {"engine": "frontier"}, "start: 'frontier' needs one start"),
         (np.ones((2, 2), bool), {"engine": "magic"}, "engine: got 'magic'"),
         (np.ones((2, 2), bool), {"weight": 2}, "weight: has no effect with engine 'auto'"),
         (np.ones((2, 2), bool), {"weight": 0, "engine": "astar"}, "weight: got 0"),

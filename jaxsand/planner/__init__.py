@@ -6,18 +6,20 @@ so the walk stays on the goal's cells (arXiv:1908.02745, "Single Stroke").
 
 import math
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
+
+import numpy as np
 
 from jaxsand.planner.anytime import anytime, nearest_first, simple_bound
 from jaxsand.planner.astar import LARGEST, astar
 from jaxsand.planner.board import Board, Cell, Problem, connected_pieces, make_problem
 from jaxsand.planner.exact import exact
 from jaxsand.planner.paper import ALPHA, paper
-from jaxsand.planner.plans import Plan, as_plan
+from jaxsand.planner.plans import Found, Plan, as_plan
 
 __all__ = ["Board", "Cell", "Engine", "Plan", "Problem", "connected_pieces", "make_problem", "plan"]
 
-Engine = Literal["auto", "paper", "astar", "exact", "anytime"]
+Engine = Literal["auto", "paper", "astar", "exact", "anytime", "frontier"]
 _WIDTH = 16_384
 _UNLIMITED = 1 << 60
 
@@ -41,7 +43,8 @@ def plan(
       turn_cost: what a change of heading costs, in steps; a reversal is one change.
       engine: `auto` proves the best with the sweeps of `exact`, or with A* where turns cost, within some seconds; `exact`
         goes on until it is proven; `astar` is A* with a proven bound, dead ends pruned; `paper` the search of
-        arXiv:1908.02745; `anytime` improves a first walk until `seconds` are over (10 if not given).
+        arXiv:1908.02745; `anytime` improves a first walk until `seconds` are over (10 if not given); `frontier` is A* by
+        whole layers on JAX's device, for one start.
       weight: by how much A* and the paper's search overrate what is left (1; above 1 is greedier and proves less; the
         paper's alpha is 7.2 / weight).
       bound: expansions after which they give up; then the walk goes on to the nearest cell to dig, and `optimal` is false
@@ -68,6 +71,8 @@ def plan(
             found = astar(problem, bound or 200_000, weight or 1)
         case "exact":
             found = anytime(problem, seconds) if seconds else exact(problem, bound or _UNLIMITED)
+        case "frontier":
+            found = _layered(problem, bound)
         case "anytime":
             found = anytime(problem, 10 if seconds is None else seconds)
     lower = max(found.lower_bound, simple_bound(problem))
@@ -75,13 +80,24 @@ def plan(
     return as_plan(problem, replace(found, walk=walk, lower_bound=lower), engine)
 
 
+def _layered(problem: Problem, bound: int | None) -> Found:
+    """The search by whole layers of planner/frontier.py, which runs on any device of JAX."""
+    from jaxsand.planner.frontier import layered, two_colours
+    from jaxsand.planner.graph import goal_only
+
+    dig = np.zeros(problem.board.shape, bool)
+    dig[tuple(np.array(problem.board.cells).T)] = True
+    found = layered(goal_only(dig, problem.board.cells[problem.starts[0]]), two_colours, limit=bound or 1 << 27)
+    return Found(list(found.walk) if found.walk else None, found.lower_bound, found.expanded, found.opened)
+
+
 def _check(problem: Problem, engine: str, weight: float | None, bound: int | None, seconds: float | None) -> None:
-    engines = ("auto", "paper", "astar", "exact", "anytime")
+    engines = get_args(Engine)
     if engine not in engines:
         raise ValueError(f"engine: got {engine!r}; give one of {', '.join(engines)}")
     for field, value, users in (
         ("weight", weight, ("paper", "astar")),
-        ("bound", bound, ("auto", "paper", "astar", "exact")),
+        ("bound", bound, ("auto", "paper", "astar", "exact", "frontier")),
         ("seconds", seconds, ("auto", "exact", "anytime")),
     ):
         if value is None:
@@ -90,7 +106,9 @@ def _check(problem: Problem, engine: str, weight: float | None, bound: int | Non
             raise ValueError(f"{field}: has no effect with engine {engine!r}; leave it out, or use {' or '.join(users)}")
         if not 0 < value < math.inf:
             raise ValueError(f"{field}: got {value}; give a number above 0")
-    if problem.turn_cost and engine in ("paper", "exact"):
+    if engine == "frontier" and (len(problem.starts) > 1 or problem.end is not None):
+        raise ValueError("start: 'frontier' needs one start and no end; give (row, column), or use another engine")
+    if problem.turn_cost and engine in ("paper", "exact", "frontier"):
         raise ValueError(f"turn_cost: {engine!r} does not know turns; use astar, anytime or auto")
     if engine == "astar" and len(problem.board.cells) > LARGEST:
         raise ValueError(f"map: got {len(problem.board.cells)} cells, too many for astar ({LARGEST}); use exact or anytime")
