@@ -78,7 +78,9 @@ def _parser() -> argparse.ArgumentParser:
     p.set_defaults(run=run_plan)
 
     p = commands.add_parser("bench", help="error against run time, and speed beside plain numpy and plain C")
-    p.add_argument("what", nargs="?", choices=["settle", "push", "plan", "all", "stability", "letters"], default="all")
+    p.add_argument(
+        "what", nargs="?", choices=["settle", "push", "plan", "sand", "all", "stability", "letters"], default="all"
+    )
     p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report and its figure")

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import analysis, complexity, expansions, goals, piles, stability, workprec
+from jaxsand import analysis, complexity, expansions, goals, piles, sandbench, stability, workprec
 from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
@@ -45,7 +45,7 @@ _C = "C loop, one core"
 
 
 def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int = 3) -> dict[str, Any]:
-    """The figures for `what`: settle, push, plan, or all of these; stability, or letters.
+    """The figures for `what`: settle, push, plan, or all of these; sand, stability, or letters.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
     """
@@ -71,6 +71,9 @@ def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int 
     if what in ("plan", "all"):
         report |= complexity.planning(tell)
         report["expansions"] = expansions.rows_of_expansions(tell)
+    if what == "sand":
+        report["children"] = sandbench.children_per_second()
+        report["sand"] = sandbench.bench_sand(tell)
     if what == "stability":
         report["stability"] = stability.stability(tell=tell)
     if what == "letters":

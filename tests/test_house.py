@@ -22,8 +22,8 @@ FLOORS = [
     {"push", "swath"},
     {"sim"},
     {"task", "goals", "planner", "plain"},
-    {"shaping", "files"},
-    {"workprec", "stability", "complexity", "expansions"},
+    {"shaping", "files", "sandplan"},
+    {"workprec", "stability", "complexity", "expansions", "sandbench"},
     {"analysis", "piles"},
     {"render", "benchmark"},
     {"commands"},
@@ -37,6 +37,7 @@ INSIDE = {
         {"exact"},
         {"anytime"},
     ],
+    "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],
     "commands": [{"printing"}, {"shape", "settle", "plan", "bench"}],
 }
 HEAVY = {"matplotlib": {"render", "goals"}, "PIL": {"render", "goals"}}

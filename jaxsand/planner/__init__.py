@@ -64,6 +64,10 @@ def plan(
         if turn_cost:
             engine = "astar" if len(problem.board.cells) <= LARGEST else "anytime"
         bound = bound or (200_000 if turn_cost else _WIDTH)
+    first = nearest_first(problem)
+    simple = simple_bound(problem)
+    if engine == "exact" and len(first) - 1 == simple:
+        return as_plan(problem, Found(first, simple, 0, 0), engine)
     match engine:
         case "paper":
             found = paper(problem, ALPHA / (weight or 1), bound or 2_000_000)
@@ -75,8 +79,8 @@ def plan(
             found = _layered(problem, bound)
         case "anytime":
             found = anytime(problem, 10 if seconds is None else seconds)
-    lower = max(found.lower_bound, simple_bound(problem))
-    walk = found.walk if found.walk is not None else nearest_first(problem)
+    lower = max(found.lower_bound, simple)
+    walk = found.walk if found.walk is not None else first
     return as_plan(problem, replace(found, walk=walk, lower_bound=lower), engine)
 
 

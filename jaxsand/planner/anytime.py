@@ -79,18 +79,20 @@ def nearest_first(problem: Problem) -> list[int]:
 def _into_the_smaller(board: Board, beside: list[int], left: set[int]) -> int:
     """Of neighbours to dig the one in the smallest piece, then with the fewest neighbours; pieces count as far as 200."""
     size: dict[int, int] = {}
-    for j in beside if len(beside) > 1 else ():
-        if j not in size:
-            piece = dict.fromkeys([j])
-            queue = [j]
-            for here in queue:
-                more = [i for i in board.near[here] if i in left and i not in piece]
-                piece.update(dict.fromkeys(more))
-                queue += more
-                if len(queue) > 200:
-                    break
-            size |= {i: len(queue) for i in beside if i in piece} | {j: len(queue)}
-    return min(beside, key=lambda j: (size.get(j, 0), sum(i in left for i in board.near[j])))
+    for j in beside:
+        if j in size:
+            continue
+        others = set(beside) - {j}
+        piece, queue = {j}, [j]
+        for here in queue:
+            more = [i for i in board.near[here] if i in left and i not in piece]
+            piece.update(more)
+            queue += more
+            others -= piece
+            if not others or len(queue) > 200:
+                break
+        size |= dict.fromkeys([i for i in beside if i in piece], len(queue))
+    return min(beside, key=lambda j: (size[j], sum(i in left for i in board.near[j])))
 
 
 def _way(board: Board, start: int, targets: set[int]) -> list[int]:

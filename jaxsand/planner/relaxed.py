@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 ALONE, EVEN, ODD = 0, 1, 2
 FAR = 1 << 14
-_WIDEST = 10
+_WIDEST = 10  # cells of a frontier
+_ENTRIES = 1 << 27  # in all tables; two bytes each
 _JOINED, _FLIPPED = np.array([EVEN, EVEN, ODD]), np.array([ODD, ODD, EVEN])
 
 
@@ -61,9 +62,10 @@ Rest = Tables | Degrees
 
 
 def rest_of(steps: Sequence["Step"], ends: "Ends", colour: Sequence[int], tick: Callable[[], None]) -> Rest:
-    """Tables where the frontier is narrow enough, else the bound by degrees."""
-    widest = max(len(step.live) for step in steps)
-    return _tables(steps, ends, tick) if widest <= _WIDEST else _degrees(steps, ends, colour)
+    """Tables where they are small enough, else the bound by degrees."""
+    live = [len(step.live) for step in steps]
+    entries = sum(3**n for n in live) * (ends.count + 1) if max(live) <= _WIDEST else _ENTRIES + 1
+    return _tables(steps, ends, tick) if entries <= _ENTRIES else _degrees(steps, ends, colour)
 
 
 def _tables(steps: Sequence["Step"], ends: "Ends", tick: Callable[[], None]) -> Tables:

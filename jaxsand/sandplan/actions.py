@@ -1,0 +1,136 @@
+"""What a planner on real sand may do: strokes with the tool lifted in between, or steps with the tool down."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxsand.scene import Scene
+
+Path = np.ndarray  # [n, 2]: x, y (m)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Straight strokes, the tool lifted in between; lengths in spacings.
+
+    They are proposed with both ends on a lattice of `pitch`, from `shortest` to `longest`, and then moved off it where that
+    brings the sand closer; none becomes longer than `longest`.
+    """
+
+    pitch: float = 1.0
+    shortest: float = 2.0
+    longest: float = math.inf
+
+
+@dataclass(frozen=True)
+class Steps:
+    """One path with the tool down, in legs of `cell` grid cells north, east, south or west.
+
+    The corners are the centres of the blocks of `cell` x `cell` grid cells that fit within `margin` grid cells of the edge.
+    """
+
+    cell: int = 6
+    margin: int = 0
+
+
+Actions = Lattice | Steps
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scene, a map [H, W] (m) at rest, a goal [H, W], and how many strokes or legs at most, of which kind."""
+
+    scene: Scene
+    height: np.ndarray
+    goal: np.ndarray
+    strokes: int
+    actions: Any
+
+
+def longest_stroke(scene: Scene, actions: Actions) -> float:
+    """The longest stroke or leg that there is (m)."""
+    spacing = float(scene.grid.spacing)
+    if isinstance(actions, Steps):
+        return actions.cell * spacing
+    return min(actions.longest, math.hypot(*scene.grid.shape)) * spacing
+
+
+def propose(
+    scene: Scene, actions: Lattice, height: np.ndarray, goal: np.ndarray, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Random strokes [count, 4] (m) on the lattice that may bring `height` closer to `goal`.
+
+    Starts lie where there is too much sand, ends where there is too little, where there is too much, or anywhere, in equal
+    shares; a fourth share lies anywhere.
+    """
+    spacing = float(scene.grid.spacing)
+    points = _lattice(scene, actions)
+    rows, columns = np.floor(points[:, ::-1] / spacing).astype(int).T
+    surplus = _blurred(height - goal)[rows, columns]
+    anywhere = np.full(len(points), 1 / len(points))
+    much, little = _shares(surplus, anywhere), _shares(-surplus, anywhere)
+    longest = longest_stroke(scene, actions) * (1 + 1e-9)
+    found = np.zeros((0, 4))
+    while len(found) < count:
+        quarters = [
+            np.concatenate([points[rng.choice(len(points), count // 2 + 4, p=share)] for share in pair], axis=1)
+            for pair in ((much, little), (much, much), (much, anywhere), (anywhere, anywhere))
+        ]
+        drawn = rng.permutation(np.concatenate(quarters))
+        length = np.hypot(*(drawn[:, 2:] - drawn[:, :2]).T)
+        fitting = (length >= actions.shortest * spacing * (1 - 1e-9)) & (length <= longest) & (length > 0)
+        found = np.concatenate([found, drawn[fitting]])
+    return found[:count]
+
+
+def moved(scene: Scene, actions: Lattice, strokes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Strokes [n, 4] (m), each with its start, its end, both alike or both apart moved by a few hundredths of a spacing to a
+    few spacings."""
+    size = float(scene.grid.spacing) * np.exp(rng.uniform(np.log(0.05), np.log(3), (len(strokes), 1)))
+    start, end = (rng.normal(size=(len(strokes), 2)) * size for _ in range(2))
+    way = rng.integers(0, 4, (len(strokes), 1))
+    end = np.where(way == 0, start, np.where(way == 1, 0, end))
+    return confined(scene, actions, strokes + np.concatenate([np.where(way == 2, 0, start), end], axis=1))
+
+
+def confined(scene: Scene, actions: Lattice, strokes: np.ndarray) -> np.ndarray:
+    """Strokes with both ends on the map and no longer than allowed."""
+    spacing = float(scene.grid.spacing)
+    rows, columns = scene.grid.shape
+    low, high = spacing / 2, (np.array([columns, rows, columns, rows]) - 0.5) * spacing
+    strokes = np.clip(strokes, low, high)
+    run = strokes[:, 2:] - strokes[:, :2]
+    length = np.hypot(*run.T)[:, None]
+    longest = longest_stroke(scene, actions)
+    run = run * np.where(length > longest, longest / np.where(length > 0, length, 1), 1)
+    return np.concatenate([strokes[:, :2], strokes[:, :2] + run], axis=1)
+
+
+def corners(scene: Scene, steps: Steps, offset: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """Where a path of steps may turn: [rows, columns, 2] of x, y (m), row 0 at the bottom; `offset` rows and columns up."""
+    y, x = (
+        (steps.margin + o + (np.arange((n - 2 * steps.margin - o) // steps.cell) + 0.5) * steps.cell)
+        * float(scene.grid.spacing)
+        for n, o in zip(scene.grid.shape, offset, strict=True)
+    )
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def _lattice(scene: Scene, actions: Lattice) -> np.ndarray:
+    step = actions.pitch * float(scene.grid.spacing)
+    rows, columns = (max(1, int(n / actions.pitch + 1e-9)) for n in scene.grid.shape)
+    x, y = np.meshgrid((np.arange(columns) + 0.5) * step, (np.arange(rows) + 0.5) * step)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def _shares(amount: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    amount = np.maximum(amount, 0)
+    return amount / amount.sum() if amount.sum() > 0 else otherwise
+
+
+def _blurred(height: np.ndarray) -> np.ndarray:
+    """The mean of each cell, twice, and its four neighbours."""
+    p = np.pad(np.asarray(height, float), 1, mode="edge")
+    return (2 * p[1:-1, 1:-1] + p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 6

@@ -1,0 +1,94 @@
+"""How much a stroke can change a map at the very most, and so how close to a goal a number of strokes can come at best.
+
+Settling is the gradient flow of a convex function of the heights, so that it brings no two maps farther apart in l2; and
+with rates in the stable range it keeps the order of maps (h <= h' everywhere stays so) and their volume, so that it brings
+no two farther apart in l1. Order is what counts here. Let h be a map at rest, S the cells that the blade covers in some
+strokes, -d the height of its bottom and mu = tan(angle of repose). Then
+
+    u(x) = min(h(x), -d + mu dist(x, S))
+
+is at rest too, since neither part is steeper than mu, and whatever these strokes do, the map stays above it: the blade takes
+only what lies above -d in the cells it covers, sand set down raises the map, and settling, with a blade in the way or
+without, keeps it above u, which does not move. So n strokes that each cover some S_k lower the map by no more than
+
+    sum (h - h')+  <=  sum max_k (h - u_k)  <=  n A,    A = max over strokes of sum (h - u)
+
+and, as sand is conserved, raise it by no more. The largest A over all strokes is found on a lattice of placements of a
+rectangle as long as the longest stroke, widened by as much as a placement in between may lie off (see `most_lowered`).
+Valid for 4 and 8 neighbours, in exact arithmetic, for sand that settles by small steps to tolerance 0.
+"""
+
+import math
+
+import numpy as np
+
+from jaxsand.scene import Scene
+from jaxsand.tool import Blade
+from jaxsand.walls import Closed
+
+
+def least_distance(scene: Scene, height: np.ndarray, goal: np.ndarray, strokes: int, longest: float) -> float:
+    """No plan of at most so many strokes, each at most `longest` (m), brings `height`, at rest, closer to `goal` in l2 (m).
+
+        min |h + v - g|_2   with   sum v-  <=  n A,   sum v+  <=  n A,   v-  <=  (h + d)+
+
+    whose answer cuts surplus and lack off at one level each. Where no sand drains, it is also no closer than the difference
+    of the mean heights over all cells. For isotropic sand, whose A is not proven, that alone counts.
+    """
+    surplus = np.asarray(height, float) - np.asarray(goal, float)
+    uneven = abs(surplus.sum()) / math.sqrt(surplus.size) if isinstance(scene.edge, Closed) else 0.0
+    if scene.grid.neighbours == "isotropic":
+        return float(uneven)
+    amount = strokes * most_lowered(scene, height, longest)
+    above = np.maximum(np.asarray(height, float) + blade_size(scene)[2], 0)
+    left = _cut_off(np.maximum(surplus, 0), above, amount) ** 2 + _cut_off(np.maximum(-surplus, 0), np.inf, amount) ** 2
+    return max(float(uneven), math.sqrt(left.sum()))
+
+
+def most_lowered(scene: Scene, height: np.ndarray, longest: float) -> float:
+    """A: by how much one stroke of at most `longest` (m) can lower a map at rest, summed over the cells (m).
+
+    Every stroke lies within a rectangle of the full length about the stroke's middle. Of these, those with the middle on a
+    lattice of half a spacing and 64 headings are tried; no other lies farther off than
+    delta = sqrt(2) dx / 4 + (half the rectangle's diagonal) (pi / 128), which the distance to S is shortened by.
+    """
+    width, thickness, depth = blade_size(scene)
+    dx = float(scene.grid.spacing)
+    mu = float(np.min(np.tan(np.asarray(scene.material.repose_angle, float))))
+    above = np.asarray(height, float) + depth
+    rows, columns = above.shape
+    long, wide = (longest + thickness + dx) / 2, (width + dx) / 2  # the blade's share of a cell fades over a spacing
+    headings, pitch = 64, dx / 2
+    delta = pitch / math.sqrt(2) + math.hypot(long, wide) * math.pi / (2 * headings)
+    x, y = (np.arange(columns) + 0.5) * dx, (np.arange(rows) + 0.5) * dx
+    middles_x, middles_y = np.arange(0, columns * dx + pitch / 2, pitch), np.arange(0, rows * dx + pitch / 2, pitch)
+    most = 0.0
+    for heading in np.arange(headings) * math.pi / headings:
+        cos, sin = math.cos(heading), math.sin(heading)
+        for my in middles_y:
+            px, py = x - middles_x[:, None, None], (y - my)[:, None]
+            beyond = np.maximum(np.abs(px * cos + py * sin) - long, 0)
+            aside = np.maximum(np.abs(py * cos - px * sin) - wide, 0)
+            rise = mu * np.maximum(np.sqrt(beyond**2 + aside**2) - delta, 0)
+            most = max(most, float(np.maximum(above - rise, 0).sum((1, 2)).max()))
+    return most
+
+
+def blade_size(scene: Scene) -> tuple[float, float, float]:
+    """The blade's width, thickness and depth (m); raises ValueError where the scene has none."""
+    blade = scene.tool
+    if not isinstance(blade, Blade):
+        raise ValueError(f"scene.tool: got {type(blade).__name__}, which moves no sand; give make_scene(..., tool=Blade())")
+    return float(blade.width), float(blade.thickness), float(blade.depth)
+
+
+def _cut_off(excess: np.ndarray, at_most: np.ndarray | float, amount: float) -> np.ndarray:
+    """What is left of `excess`, least in l2, when `amount` in all and `at_most` of each may be taken away."""
+    taken = np.minimum(excess, at_most)
+    if taken.sum() <= amount:
+        return excess - taken
+    low, high = 0.0, float(excess.max())
+    for _ in range(60):
+        level = (low + high) / 2
+        low, high = (level, high) if np.clip(excess - level, 0, at_most).sum() > amount else (low, level)
+    return excess - np.clip(excess - low, 0, at_most)

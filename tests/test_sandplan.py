@@ -1,0 +1,197 @@
+"""Planning on real sand: what a plan says of itself holds, and its bound does."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxsand.rivals import binary, greedy, shooting
+
+import jaxsand as js
+from jaxsand.sandbench import bench_sand
+from jaxsand.sandplan.actions import Job, corners, longest_stroke, moved, propose
+from jaxsand.sandplan.binary import binary_paths, straight_runs
+from jaxsand.sandplan.reach import least_distance, most_lowered
+from jaxsand.sandplan.rollouts import Effort, distance, distinct, marks, pushed, replay, roughly_pushed, walked
+from jaxsand.sandplan.tasks import SAND_TASKS, sand_task
+
+SHAPE = (14, 14)
+SCENE = js.make_scene(SHAPE, 0.01, tool=js.Blade())
+LEVEL = np.zeros(SHAPE, np.float32)
+STROKES = np.array([[0.03, 0.05, 0.11, 0.05], [0.03, 0.09, 0.11, 0.09]])
+GOAL = replay(SCENE, LEVEL, [s.reshape(2, 2) for s in STROKES])
+BUDGET = 300
+
+
+@pytest.fixture(scope="module")
+def found():
+    return js.plan_sand(SCENE, LEVEL, GOAL, strokes=2, budget=BUDGET)
+
+
+def test_a_plan_replayed_leaves_what_it_says(found):
+    height = replay(SCENE, LEVEL, found.paths)
+    np.testing.assert_array_equal(height, found.height)
+    assert float(distance(height, GOAL)) == found.after
+    rolled = js.rollout(SCENE, jnp.asarray(LEVEL), jnp.asarray(found.strokes, jnp.float32))
+    assert float(distance(np.asarray(rolled.height[-1]), GOAL)) == pytest.approx(found.after, rel=1e-3)
+    assert found.before == float(distance(LEVEL, GOAL))
+    assert 0 < len(found.paths) <= 2
+
+
+def test_a_plan_gains_and_its_bounds_hold(found):
+    assert found.after < 0.8 * found.before
+    assert found.lower_bound <= found.after
+    assert found.estimate <= found.after + 1e-9
+    assert found.gap == found.after - found.lower_bound
+    assert found.reduction == 1 - found.after / found.before
+    assert found.effort.cost <= 1.5 * BUDGET
+
+
+def test_equal_seeds_give_equal_plans(found):
+    again = js.plan_sand(SCENE, LEVEL, GOAL, strokes=2, budget=BUDGET)
+    np.testing.assert_array_equal(again.strokes, found.strokes)
+    assert again.effort == found.effort
+    other = js.plan_sand(SCENE, LEVEL, GOAL, strokes=2, budget=BUDGET, seed=1)
+    assert not np.array_equal(other.strokes, found.strokes)
+
+
+def test_at_the_goal_there_is_nothing_to_do():
+    done = js.plan_sand(SCENE, GOAL, GOAL, strokes=2, budget=BUDGET)
+    assert (done.paths, done.before, done.after, done.reduction, done.effort) == ((), 0.0, 0.0, 0.0, Effort())
+    assert done.strokes.shape == (0, 4)
+
+
+def test_steps_find_a_path_again():
+    steps = js.Steps(cell=2)
+    at = corners(SCENE, steps)
+    goal = replay(SCENE, LEVEL, [at[3, 1:5]])
+    plan = js.plan_sand(SCENE, LEVEL, goal, strokes=3, actions=steps, budget=200)
+    assert plan.after == pytest.approx(0, abs=1e-7)
+    assert len(plan.paths) == 1
+    runs = np.abs(np.diff(plan.paths[0], axis=0))
+    np.testing.assert_allclose(runs.sum(1), steps.cell * 0.01)
+
+
+@pytest.mark.parametrize("neighbours", [4, 8])
+@pytest.mark.parametrize("surface", ["level", "rough"])
+def test_no_stroke_lowers_more_than_the_proven_amount(surface, neighbours):
+    """And the map stays above u of `reach`, which the amount is the sum below."""
+    scene = js.make_scene(SHAPE, 0.01, tool=js.Blade(), neighbours=neighbours)
+    rng = np.random.default_rng(3)
+    rough = {"level": 0.0, "rough": 0.02}[surface] * rng.normal(size=SHAPE)
+    height = np.asarray(js.settle(scene, rough.astype(np.float32)).height)
+    most, longest = 0.0, 0.08
+    ways = propose(scene, js.Lattice(longest=8), height, height, 32, rng)
+    maps = np.repeat(height[None], 32, axis=0)
+    for _ in range(2):
+        maps = pushed(scene, maps, ways)
+        ways = ways[::-1]
+        most += most_lowered(scene, height, longest)
+        assert np.maximum(height - maps, 0).sum((1, 2)).max() <= most
+        assert np.maximum(maps - height, 0).sum((1, 2)).max() <= most * (1 + 1e-4)
+    assert np.all(maps >= np.minimum(height, -0.0075) - 1e-5)
+
+
+def test_the_bound_is_exact_where_it_can_be_told():
+    high = LEVEL + np.float32(0.001)
+    assert least_distance(SCENE, high, LEVEL, 9, 0.1) == pytest.approx(0.014)  # no sand to be lost
+    far = LEVEL.copy()
+    far[:7], far[7:] = 1.0, -1.0  # far more to move than a stroke can
+    amount = most_lowered(SCENE, LEVEL, 0.05)
+    assert math.sqrt(98 * 1 + 98 * 0.9925**2) - 0.1 < least_distance(SCENE, LEVEL, far, 1, 0.05) < 14
+    assert least_distance(SCENE, LEVEL, far, 2, 0.05) < least_distance(SCENE, LEVEL, far, 1, 0.05)
+    assert amount > 0.0075 * 2 * 5
+    isotropic = js.make_scene(SHAPE, 0.01, tool=js.Blade(), neighbours="isotropic")
+    assert least_distance(isotropic, LEVEL, far, 1, 0.05) == 0
+
+
+def test_nodes_that_look_alike_are_one():
+    maps = np.random.default_rng(0).normal(size=(4, *SHAPE)).astype(np.float32)
+    maps[2] = maps[0] + 1e-7
+    names = marks(maps, 0.1)
+    parent = np.array([0, 0, 1, 1])
+    assert distinct(names, parent, np.array([2, 0, 1, 3]), 4, 4) == [2, 1, 3]
+    assert distinct(names, parent, np.array([0, 1, 2, 3]), 4, 1) == [0, 3]
+    assert distinct(names, parent, np.array([3, 1, 2, 0]), 2, 4) == [3, 1]
+
+
+def test_children_are_pushed_as_they_would_be_alone():
+    ways = np.concatenate([STROKES, STROKES[:, [2, 3, 0, 1]], STROKES / 2])
+    maps = pushed(SCENE, np.repeat(GOAL[None], len(ways), axis=0), ways)
+    for one, way in zip(maps, ways, strict=True):
+        np.testing.assert_allclose(one, js.step(SCENE, GOAL, way.astype(np.float32)).height, atol=2e-5)
+    rough = roughly_pushed(SCENE, np.repeat(GOAL[None], len(ways), axis=0), ways)
+    assert np.abs(rough - maps).sum() < 0.6 * np.abs(maps - GOAL).sum()
+    down, lifted = walked(SCENE, np.repeat(LEVEL[None], 2, axis=0), STROKES)
+    np.testing.assert_allclose(lifted[0], js.step(SCENE, LEVEL, STROKES[0].astype(np.float32)).height, atol=2e-5)
+    assert np.abs(down - lifted).max() > 1e-3
+
+
+def test_strokes_stay_on_the_map_and_within_their_length():
+    rng = np.random.default_rng(0)
+    actions = js.Lattice(pitch=2.0, shortest=3.0, longest=6.0)
+    ways = propose(SCENE, actions, LEVEL, GOAL, 50, rng)
+    assert ways.shape == (50, 4)
+    np.testing.assert_allclose((ways / 0.01 - 1) % 2, 0, atol=1e-6)
+    for strokes, least in ((ways, 0.03), (moved(SCENE, actions, ways, rng), 0)):
+        length = np.hypot(*(strokes[:, 2:] - strokes[:, :2]).T)
+        assert np.all((length >= least - 1e-9) & (length <= longest_stroke(SCENE, actions) + 1e-9))
+        assert np.all(np.abs(strokes - 0.07) <= 0.065 + 1e-9)
+
+
+def test_the_binary_plan_and_the_rivals():
+    drawn = LEVEL.copy()
+    drawn[4:6, 2:10], drawn[6:10, 8:10] = -0.0075, -0.0075
+    (walk,) = binary_paths(SCENE, LEVEL, drawn, js.Steps(2))
+    assert len(walk) == 6
+    assert [b - a for a, b in straight_runs(walk)] in ([3, 2], [2, 3])
+    job = Job(SCENE, LEVEL, GOAL, 2, js.Lattice())
+    for rival in (binary, greedy, shooting):
+        paths, effort = rival(job, 60, np.random.default_rng(0))
+        assert distance(replay(SCENE, LEVEL, paths), GOAL) <= distance(LEVEL, GOAL)
+        assert effort.full > 0
+    assert greedy(job, 60, np.random.default_rng(0))[1].cost <= 60
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"strokes": 0}, "strokes: got 0; give a whole number"),
+        ({"budget": 2.5}, "budget: got 2.5; give a whole number"),
+        ({"seed": -1}, "seed: got -1; give a whole number"),
+        ({"actions": "lattice"}, "actions: got 'lattice'; give Lattice"),
+        ({"actions": js.Lattice(pitch=0.0)}, "actions.pitch: got 0.0; give spacings"),
+        ({"actions": js.Lattice(longest=0.5)}, "actions.longest: got 0.5 with"),
+        ({"actions": js.Steps(cell=0)}, "actions.cell: got 0; give a whole number"),
+        ({"actions": js.Steps(cell=8)}, "actions.cell: got 8 with margin 0 on .* smaller"),
+        ({"scene": js.make_scene(SHAPE, 0.01)}, "scene.tool: got NoTool, which moves no sand; give"),
+        ({"goal": GOAL[:5]}, "goal: got shape .*; make the scene as large"),
+        ({"goal": GOAL * np.nan}, "goal: got 196 cells that are not finite; fill"),
+        ({"height": GOAL * np.nan}, "height: got 196 cells that are not finite; fill"),
+        ({"height": LEVEL[0]}, "height: got shape"),
+        ({"height": LEVEL + 0.1 * np.eye(14)}, "height: got a slope of .* settle it first"),
+    ],
+)
+def test_bad_input(change, message):
+    given = {"scene": SCENE, "height": LEVEL, "goal": GOAL, **change}
+    with pytest.raises(ValueError, match=message):
+        js.plan_sand(given.pop("scene"), given.pop("height"), given.pop("goal"), **given)
+
+
+def test_every_task_is_at_rest_and_has_something_to_do():
+    for name in SAND_TASKS:
+        task = sand_task(name)
+        assert float(js.steepest_slope(task.scene, task.height)) < math.tan(math.radians(29)) + 2e-3
+        assert float(distance(task.height, task.goal)) > 0.01
+        assert abs(float(np.mean(task.goal - task.height))) < 1e-6
+    with pytest.raises(ValueError, match="task: got 'sieve'; give one of crossing, twin"):
+        sand_task("sieve")
+
+
+@pytest.mark.slow
+def test_the_search_ends_a_fifth_closer_than_its_rivals_on_five_tasks():
+    rows = bench_sand(names=("crossing", "twin", "frame", "ridge", "stem"))
+    closer = [row["closer"] for row in rows if row["method"] == "search"]
+    assert len(closer) == 5
+    assert min(closer) >= 0.2
+    assert all(row["lower_bound"] <= row["after"] + 1e-9 for row in rows)
