@@ -212,7 +212,8 @@ def _path(axes: "Axes", result: ShapeResult) -> None:
         runs = np.diff(path, axis=0)
         middle = (path[:-1] + path[1:]) / 2
         axes.quiver(*middle.T, *_unit(runs).T, angles="xy", scale=38, width=0.006, pivot="mid", color="black")
-    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncol=2, fontsize=8, frameon=False)
+    if result.target.paths:
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncol=2, fontsize=8, frameon=False)
 
 
 def _unit(runs: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import pairwise
 from typing import Literal
@@ -16,6 +16,7 @@ from jaxsand import goals, task
 from jaxsand.planner import Cell, connected_pieces, plan
 from jaxsand.push import SteppedPush
 from jaxsand.rules import UntilStill
+from jaxsand.sandplan import SandPlan, plan_sand
 from jaxsand.scene import Scene, make_scene
 from jaxsand.settling import settle, steepest_slope
 from jaxsand.sim import Shaped, act, check, follow_frames
@@ -63,6 +64,7 @@ class Target:
     depth: float
     optimal: bool | None = None  # whether the steps are proven fewest, and what is proven of them; plans only
     lower_bound: float | None = None
+    found: SandPlan | None = None  # what a search on real sand says of itself
 
     @property
     def footprint(self) -> tuple[float, float]:
@@ -170,6 +172,17 @@ def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> 
     return height_target(goal, "image", name, layout)
 
 
+def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: int, seed: int, tell: Tell) -> Target:
+    """The same goal, by at most so many strokes from a search on real sand, at a cost of about `pushes` (see `plan_sand`).
+
+    Sand counts wherever it lies, also where the goal was drawn without berms.
+    """
+    start = _at_rest(target.scene, before, tell)
+    tell(f"searching {strokes} strokes in about {pushes} pushes")
+    found = plan_sand(target.scene, start, target.goal, strokes=strokes, budget=pushes, seed=seed)
+    return replace(target, method="search", paths=found.paths, optimal=None, lower_bound=None, found=found)
+
+
 def terrain_surface(shape: tuple[int, int], relief: float) -> np.ndarray:
     """The terrain sample at another shape, around height 0, `relief` (m) from its lowest to its highest point."""
     land = task.resample(goals.terrain(), shape)
@@ -184,17 +197,10 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
     """
     scene = target.scene
     began = time.perf_counter()
-    if before is None:
-        start = np.zeros(scene.grid.shape, np.float32)
-    else:
-        task.fits(scene, before)
-        tell("settling the surface")
-        rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
-        check(rested)
-        start = np.asarray(rested.height)
+    start = _at_rest(scene, before, tell)
     prepared = time.perf_counter()
     tell("compiling")
-    longest = max(len(path) for path in target.paths)
+    longest = max((len(path) for path in target.paths), default=2)
     if longest > 2:  # a few lengths for all paths, so that like goals share a program
         longest = -(-longest // 32) * 32
     program, compile_seconds = _program(scene, longest)
@@ -217,6 +223,16 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
     seconds = {"prepare": prepared - began, "compile": compile_seconds, "run": ran - compiled}
     figures = _figures(target, start, height)
     return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), figures, seconds)
+
+
+def _at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
+    if before is None:
+        return np.zeros(scene.grid.shape, np.float32)
+    task.fits(scene, before)
+    tell("settling the surface")
+    rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
+    check(rested)
+    return np.asarray(rested.height)
 
 
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:

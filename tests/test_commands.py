@@ -94,6 +94,8 @@ BAD = {
     "unwritable folder": (["settle", "pile.npy", "--out-file", "a-file/x.npy"], "out: cannot write to a-file"),
     "plan of nothing": (["plan", "none.txt"], "none.txt: no such file"),
     "plan in pieces": (["plan", "apart.txt"], "map: got 2 pieces"),
+    "search for a drawn goal": (["shape", "l.txt", "--method", "search"], "method: 'search' compares berms too"),
+    "pushes without a search": (["shape", "L", "--pushes", "9"], "pushes: has an effect with --method search only"),
     "plan to nowhere": (["plan", "l.txt", "--end", "0,2"], r"end: got \(0, 2\)"),
     "plan to no cell": (["plan", "l.txt", "--end", "here"], "end: got 'here'"),
     "plan in no time": (["plan", "l.txt", "--seconds", "0"], "seconds: got 0.0"),
@@ -204,6 +206,23 @@ def test_plan_with_an_end_turns_and_a_picture(here, capsys):
     with Image.open(picture) as image:
         assert image.size[0] > 200
     assert json.loads(data.read_text())["path"] == report["path"]
+
+
+def test_search_on_real_sand(here, capsys):
+    y, x = np.indices((16, 20)) * 1.0
+    goal = 0.004 * np.sin(x / 3) * np.cos(y / 4)
+    np.save(here / "waves.npy", goal)
+    arguments = ["shape", "waves.npy", "--method", "search", "--strokes", "2", "--pushes", "40", "--resolution", "2"]
+    assert main([*arguments, "--depth-mm", "2", "--out", "waves", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    found = report["search"]
+    assert (report["method"], report["lifted"]) == ("search", report["steps"] > 1)
+    assert report["steps"] <= 2
+    assert found["lower_bound"] <= found["after"] < found["before"]
+    assert report["l2_reduction"] == pytest.approx(1 - found["after"] / found["before"], abs=1e-3)
+    assert found["before"] == pytest.approx(np.linalg.norm(goal), rel=1e-5)
+    assert 0 < found["full_pushes"] <= found["rollouts"]
+    assert all((here / file).exists() for file in report["files"])
 
 
 @pytest.mark.parametrize("goal", ["white-S.png", "dip.npy", "terrain", "7"])

@@ -3,6 +3,7 @@
 import ast
 import io
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -58,7 +59,24 @@ def settling(names):
     assert np.all(np.diff(names["values"]) < 0)
 
 
-CHECKS = {"settling": settling}
+def planning(names):
+    """Checks what notebooks/planning.ipynb says."""
+    assert names["found"].optimal
+    assert names["anywhere"].steps <= names["found"].steps <= names["home"].steps
+    assert all(0.98 < r["ratio"] < 1.13 for r in names["rows"])
+    combs = [r for r in names["sizes"] if r["name"].startswith("comb")]
+    counted = [r["paper_expanded"] for r in combs if r["paper_expanded"]]
+    assert all(3 < b / a < 6 for a, b in pairwise(counted))
+    assert all(r["astar_expanded"] == r["steps"] for r in combs)
+    nodes = {a: [r["nodes"] for r in names["alphas"] if r["alpha"] == a] for a in (7.2, 1.0)}
+    assert min(nodes[7.2]) > 10 * max(nodes[1.0])
+    assert all(plan.optimal for plan in names["proofs"].values())
+    gaps = [plan.gap for _, plan in names["timed"]]
+    assert 0 <= gaps[-1] <= gaps[0] + 1e-9
+    assert names["sand"].lower_bound <= names["sand"].after < 0.8 * names["sand"].before
+
+
+CHECKS = {"settling": settling, "planning": planning}
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")  # plt.show() where there is a display

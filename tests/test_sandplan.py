@@ -5,13 +5,13 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxsand.rivals import binary, greedy, shooting
 
 import jaxsand as js
 from jaxsand.sandbench import bench_sand
 from jaxsand.sandplan.actions import Job, corners, longest_stroke, moved, propose
 from jaxsand.sandplan.binary import binary_paths, straight_runs
 from jaxsand.sandplan.reach import least_distance, most_lowered
+from jaxsand.sandplan.rivals import binary, greedy, shooting
 from jaxsand.sandplan.rollouts import Effort, distance, distinct, marks, pushed, replay, roughly_pushed, walked
 from jaxsand.sandplan.tasks import SAND_TASKS, sand_task
 

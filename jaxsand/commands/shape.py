@@ -12,6 +12,7 @@ from jaxsand.files import as_json, existing, folder, progress, read_text, writte
 if TYPE_CHECKING:
     import numpy as np
 
+    from jaxsand.sandplan import SandPlan
     from jaxsand.shaping import Layout, ShapeResult, Target
 
 
@@ -20,13 +21,22 @@ def run_shape(options: argparse.Namespace) -> None:
     started = time.perf_counter()
     tell("reading the goal")
     from jaxsand.render import save_animation, save_figure, shape_figure
-    from jaxsand.shaping import shape
+    from jaxsand.shaping import searched, shape
 
     began = time.perf_counter()
+    if options.method != "search":
+        for option in ("strokes", "pushes", "seed"):
+            if getattr(options, option) is not None:
+                raise ValueError(f"{option}: has an effect with --method search only; leave it out")
     target = _target(options)
-    planned = time.perf_counter() - began
+    if options.method == "search" and target.drawn:
+        raise ValueError(f"method: 'search' compares berms too, which {options.goal} has none of; use --method plan")
     surface = _surface(options, target)
     out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
+    if options.method == "search":
+        strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
+        target = searched(target, surface, strokes, options.pushes or 1000 * strokes, options.seed or 0, tell)
+    planned = time.perf_counter() - began
     result = shape(target, surface, tell)
     tell("drawing")
     began = time.perf_counter()
@@ -55,6 +65,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
         "lifted": result.lifted,
         "steps": result.steps,
         **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
+        **({"search": _found(target.found)} if target.found else {}),
         **result.figures,
         "seconds": total,
         "seconds_plan": planned + seconds["prepare"],
@@ -67,11 +78,27 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
     }
 
 
+def _found(found: "SandPlan") -> dict[str, Any]:
+    """l2 distances in m; `rollouts` counts rough pushes by what they cost."""
+    return {
+        "before": found.before,
+        "after": found.after,
+        "lower_bound": found.lower_bound,
+        "gap": found.gap,
+        "estimate": found.estimate,
+        "rollouts": found.effort.cost,
+        "full_pushes": found.effort.full,
+        "rough_pushes": found.effort.rough,
+    }
+
+
 def _summary(report: dict[str, Any]) -> str:
     how = f"{report['steps']} strokes"
     if report["method"] == "plan":
         proof = "proven shortest" if report["optimal"] else f"at least {report['lower_bound']} are needed"
         how = f"{report['steps']} steps ({proof})"
+    if report["method"] == "search":
+        how += f" found in {report['search']['rollouts']:.0f} pushes"
     return "\n".join(
         (
             f"{report['goal']} ({report['goal_kind']}): {how}",
@@ -94,12 +121,12 @@ def _target(options: argparse.Namespace) -> "Target":
     is_file = suffix in (".txt", ".png", ".npy")
     if not name.strip():
         raise ValueError("goal: got an empty name; give a letter, a .txt, .png or .npy file, or terrain")
-    if method == "strokes":
-        if is_file or name == "terrain":
-            raise ValueError(f"method: 'strokes' pushes a glyph's own strokes, {name} has none; use --method plan")
+    if method == "strokes" and (is_file or name == "terrain"):
+        raise ValueError(f"method: 'strokes' pushes a glyph's own strokes, {name} has none; use --method plan")
+    if method != "plan" and not (is_file or name == "terrain"):
         for option in ("start", "depth_mm", "spacing", "resolution", "cells"):
             if getattr(options, option) is not None:
-                raise ValueError(f"{option.replace('_', '-')}: has no effect with --method strokes; leave it out")
+                raise ValueError(f"{option.replace('_', '-')}: has no effect on a glyph's own strokes; leave it out")
         letter = name.upper() if len(name) == 1 and name.isascii() and name.isalpha() else ""
         return shaping.glyph_target(goals.letter_strokes(letter) if letter else goals.text_strokes(name), name)
     start = read_cell(options.start)
