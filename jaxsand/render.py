@@ -99,8 +99,9 @@ def plan_figure(dig: np.ndarray, plan: Plan) -> "Figure":
     axes.plot(*cells[-1], "s", color="black", ms=10 * side / 0.5, mfc="none", label="end")
     if len(lines):
         figure.colorbar(order, ax=axes, label="step", shrink=0.7)
-    proof = "proven shortest" if plan.optimal else f"at least {plan.lower_bound:g} are needed"
-    figure.suptitle(f"{plan.steps} steps, {proof}", fontsize=11)
+    what = f"{plan.steps} steps" if plan.cost == plan.steps else f"cost {plan.cost:g} in {plan.steps} steps"
+    proof = "proven least" if plan.optimal else f"at least {plan.lower_bound:g} needed"
+    figure.suptitle(f"{what}, {proof}", fontsize=11)
     axes.set(xlabel="column", ylabel="row")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(integer=True))

@@ -36,6 +36,7 @@ INSIDE = {
         {"bound", "order", "plans", "relaxed", "frontier"},
         {"astar", "paper", "sweepline"},
         {"exact"},
+        {"improve"},
         {"anytime"},
     ],
     "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],

@@ -11,11 +11,14 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 import jaxsand as js
 from jaxsand import complexity
 from jaxsand.goals import letter_map
-from jaxsand.planner import connected_pieces, make_problem
+from jaxsand.planner import connected_pieces, make_problem, relaxed
 from jaxsand.planner.anytime import nearest_first, simple_bound
 from jaxsand.planner.board import MOVES, blocks_of
 from jaxsand.planner.bound import block_bound
+from jaxsand.planner.exact import exact
+from jaxsand.planner.improve import improved
 from jaxsand.planner.plans import walk_cost
+from jaxsand.planner.sweepline import Ends, Sweep, steps_of
 
 ENGINES = ("astar", "exact", "anytime")
 
@@ -267,6 +270,70 @@ def test_blocks_share_no_edge_and_meet_in_cut_cells():
     assert sum(len(b.cells) - 1 for b in blocks) == len(board.cells) - 1  # a tree of blocks
 
 
+def test_truncated_sweeps_and_bounds_by_degrees_prove_nothing_false(monkeypatch):
+    rng = np.random.default_rng(4)
+    for k in range(300):
+        monkeypatch.setattr(relaxed, "_WIDEST", -1 if k % 2 else 10)
+        dig, cells = random_map(rng, 14, 4, 5)
+        pick = [cells[i] for i in rng.integers(len(cells), size=2)]
+        start, end = (None, pick[0])[k % 3 > 0], (None, pick[1])[k % 5 == 0]
+        problem = make_problem(dig, start, end)
+        best = shortest(problem)
+        assert exact(problem, 0).lower_bound <= best
+        for width in (1, 3, 20):
+            found = exact(problem, width)
+            assert found.lower_bound <= best
+            assert found.walk is None or len(found.walk) - 1 >= best
+        assert exact(problem, 10**6).lower_bound == best
+        walk = improved(problem, nearest_first(problem), lambda: None)
+        assert best <= len(walk) - 1 <= len(nearest_first(problem)) - 1
+        assert set(walk) == set(range(len(cells)))
+        assert walk[0] in problem.starts
+        assert problem.end in (None, walk[-1])
+        assert all(b in problem.board.near[a] for a, b in pairwise(walk))
+
+
+def test_wide_blocks_are_bounded_by_degrees_honestly():
+    for seed in range(3):
+        dig = np.ones((11, 12), bool)
+        rng = np.random.default_rng(seed)
+        dig[tuple(rng.integers(1, 10, (2, 2)))] = False
+        start = (0, 0)
+        board = make_problem(dig, start).board
+        for block in blocks_of(board.near):
+            for ends in (Ends(0, True, 1, dict.fromkeys(block.cells[1:], 0)), Ends(0, False, 0, {})):
+                if 0 in block.cells and not block.bridge:
+                    steps = steps_of(block, board.cells)
+                    tour = Sweep(block, steps, ends, relaxed.rest_of(steps, ends, board.colour, lambda: None)).search(
+                        500, lambda: None
+                    )
+                    assert tour.lower_bound <= tour.cost
+
+
+def test_long_ways_do_not_overflow():
+    length = 17_000
+    dig = np.zeros((2, 2 * length + 2), bool)
+    dig[1] = True
+    dig[0, length : length + 2] = True
+    found = js.plan(dig)
+    assert found.optimal
+    # From one end to the other, twice across the block in the middle's far side.
+    assert found.steps == 2 * length + 3
+
+
+def test_seconds_hold_on_large_maps():
+    for dig, options in (
+        (np.ones((150, 150), bool), {}),
+        (np.ones((1, 30_000), bool), {}),
+        (complexity.grown(50, 1000, 0.0, 1)[0], {"turn_cost": 1}),
+        (complexity.grown(80, 2600, 0.2, 1)[0], {}),
+    ):
+        began = time.monotonic()
+        found = js.plan(dig, seconds=1, **options)
+        assert time.monotonic() - began < 8  # about; the machine may be busy
+        assert found.lower_bound <= found.cost
+
+
 def test_whole_layers_are_an_engine_too():
     dig, start = letter_map("P")
     found = js.plan(dig, start, engine="frontier")
@@ -298,6 +365,13 @@ def test_one_cell():
         (np.ones(4, bool), {}, r"map: got bool of shape \[4\]"),
         (np.ones((2, 2), bool), {"turn_cost": -1}, "turn_cost: got -1"),
         (np.ones((2, 2), bool), {"turn_cost": 1, "engine": "exact"}, "turn_cost: 'exact' does not know turns"),
+        (np.ones((2, 2), bool), {"turn_cost": 1e17}, "turn_cost: got 1e"),
+        (np.ones((2, 2), bool), {"turn_cost": "1"}, "turn_cost: got '1'"),
+        (np.ones((2, 2), bool), {"end": (0.9, 0.2)}, "end: got"),
+        (np.ones((2, 2), bool), {"bound": 2.5}, "bound: got 2.5"),
+        (np.ones((2, 2), bool), {"bound": 2, "seconds": 1}, "bound: has no effect with seconds"),
+        (np.ones((2, 2), bool), {"seconds": "2"}, "seconds: got '2'"),
+        ([[True], [True, False]], {}, "map: got rows of different lengths"),
         (np.ones((2, 2), bool), {"engine": "frontier"}, "start: 'frontier' needs one start"),
         (np.ones((2, 2), bool), {"engine": "magic"}, "engine: got 'magic'"),
         (np.ones((2, 2), bool), {"weight": 2}, "weight: has no effect with engine 'auto'"),

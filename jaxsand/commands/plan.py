@@ -18,14 +18,14 @@ def run_plan(options: argparse.Namespace) -> None:
         dig, own = goals.letter_map(options.map.upper() if options.map.isascii() else options.map)
     else:
         dig, own = goals.read_text_map(read_text(Path(options.map)), options.map)
-    start = read_cell(options.start) if options.start else own
+    start = own if options.start is None else read_cell(options.start)
     out = folder(options.out) if options.out else None
     tell("planning")
     began = time.perf_counter()
     found = plan(
         dig,
         start,
-        end=read_cell(options.end, "end"),
+        end=None if options.end is None else read_cell(options.end, "end"),
         turn_cost=options.turn_cost,
         engine=options.engine,
         weight=options.weight,

@@ -9,7 +9,7 @@ from jaxsand.files import as_json
 
 
 def read_cell(text: str | None, field: str = "start") -> tuple[int, int] | None:
-    if text is None or text == "best":
+    if text is None or (text == "best" and field == "start"):
         return None
     try:
         row, column = (int(part) for part in text.split(","))

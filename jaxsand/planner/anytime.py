@@ -1,50 +1,66 @@
 """A walk at once, a better one with time, and how far it can be from the best."""
 
+import contextlib
 import time
 from collections.abc import Callable
 
 from jaxsand.planner.astar import LARGEST, astar
 from jaxsand.planner.board import Board, Problem
 from jaxsand.planner.exact import Blocks, exact
+from jaxsand.planner.improve import improved
 from jaxsand.planner.plans import Found, walk_cost
 from jaxsand.planner.sweepline import OutOfTime
 
-_WIDTHS = (0, 64, 512, 4096, 32_768, 262_144)
+_WIDTHS = (0, 1000, 16_384, 262_144)
 _WEIGHTS = (4.0, 2.0, 1.5, 1.2, 1.0)
+_LOOPY = 64  # cells of a block
+_LOOPY = 64  # cells of a block; smaller ones are proven before anything else pays
+_SPARE = 0.1  # of the time for making the first walk shorter
 
 
 def anytime(problem: Problem, seconds: float) -> Found:
-    """Nearest cell first, then wider and wider searches until one is proven best or the time is over.
+    """A greedy walk, made shorter; then wider and wider searches until one is proven best or the time is over.
 
     Where turns cost nothing these are sweeps with more and more states (exact.py); where they do, A* with lower and lower
-    weights as well. The lower bound is the best that any of them proved.
+    weights follows. The lower bound is the best that any of them proved, up to where it was stopped.
     """
-    stop = time.monotonic() + seconds
+    began = time.monotonic()
 
-    def tick() -> None:
-        if time.monotonic() > stop:
-            raise OutOfTime
+    def until(part: float) -> Callable[[], None]:
+        def tick() -> None:
+            if time.monotonic() > began + part * seconds:
+                raise OutOfTime
 
-    best = nearest_first(problem)
+        return tick
+
+    tick = until(1)
+    best = nearest_first(problem, until(_SPARE / 2))
     lower = float(simple_bound(problem))
     expanded = opened = 0
     blocks = Blocks(problem.board)
     tries: list[Callable[[], Found]] = [lambda width=w: exact(problem, width, tick, blocks) for w in _WIDTHS]  # type: ignore[misc]
-    if problem.turn_cost and len(problem.board.cells) <= LARGEST:
-        tries[3:] = [lambda weight=w: astar(problem, 10**9, weight, tick) for w in _WEIGHTS]  # type: ignore[misc]
-    try:
-        for search in tries:
-            tick()
+    if problem.turn_cost:
+        del tries[2:]
+        if len(problem.board.cells) <= LARGEST:
+            tries += [lambda weight=w: astar(problem, 10**9, weight, tick) for w in _WEIGHTS]  # type: ignore[misc]
+    elif len(problem.board.cells) <= LARGEST and any(len(block.cells) > _LOOPY for block in blocks.blocks):
+        tries.insert(1, lambda: Found(improved(problem, best, until(_SPARE)), 0, 0, 0))
+    for search in tries:
+        if walk_cost(problem, best) <= lower:
+            break
+        try:
             found = search()
-            expanded, opened = expanded + found.expanded, opened + found.opened
-            lower = max(lower, found.lower_bound)
-            if found.walk and walk_cost(problem, found.walk) < walk_cost(problem, best):
-                best = found.walk
-            if walk_cost(problem, best) <= lower:
-                break
-    except OutOfTime:
-        expanded += blocks.states if not expanded else 0
-    return Found(best, lower, expanded, opened)
+        except OutOfTime:
+            continue
+        expanded, opened = expanded + found.expanded, opened + found.opened
+        lower = max(lower, found.lower_bound)
+        if found.walk and walk_cost(problem, found.walk) < walk_cost(problem, best):
+            best = found.walk
+    # What the last search had proven when it was stopped.
+    if walk_cost(problem, best) > lower and blocks.known:
+        with contextlib.suppress(OutOfTime):
+            lower = max(lower, exact(problem, 0, until(1.2), blocks).lower_bound)
+    return Found(best, lower, max(expanded, blocks.states), opened)
 
 
 def simple_bound(problem: Problem) -> int:
@@ -60,15 +76,26 @@ def simple_bound(problem: Problem) -> int:
     return min(at_least(s) for s in problem.starts)
 
 
-def nearest_first(problem: Problem) -> list[int]:
+def nearest_first(problem: Problem, tick: Callable[[], None] = lambda: None) -> list[int]:
     """A walk that always goes on to the nearest cell to dig, into the smaller piece of what is left where several are as
-    near, and at last to the end."""
+    near, and at last to the end. Once `tick` raises, any of the nearest will do."""
     board = problem.board
     walk = [problem.starts[0]]
     left = set(range(len(board.cells))) - {walk[0]}
+    hurry = False
     while left:
         beside = [j for j in board.near[walk[-1]] if j in left]
-        way = [_into_the_smaller(board, beside, left)] if beside else _way(board, walk[-1], left)
+        try:
+            if not hurry:
+                tick()
+        except OutOfTime:
+            hurry = True
+        if not beside:
+            way = _way(board, walk[-1], left)
+        elif hurry:
+            way = beside[:1]
+        else:
+            way = [_into_the_smaller(board, beside, left)]
         left.difference_update(way)
         walk += way
     if problem.end is not None and walk[-1] != problem.end:

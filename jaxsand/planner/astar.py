@@ -4,6 +4,7 @@ A cell dug by mistake cannot be mended, so whatever leaves the cells to dig is a
 """
 
 import heapq
+import math
 from collections.abc import Callable
 
 from jaxsand.planner.board import Problem
@@ -27,29 +28,29 @@ def astar(problem: Problem, bound: int = 200_000, weight: float = 1.0, tick: Cal
     everything = (1 << len(board.cells)) - 1
     parent: dict[_State, _State | None] = {}
     cost: dict[_State, float] = {}
-    heap: list[tuple[float, float, int, int, int]] = []
+    heap: list[tuple[float, float, int, int, int, float]] = []  # f, -g, -left, cell, the cell before, g + h
     for s in problem.starts:
         state = (s, everything & ~(1 << s), -1)
         parent[state], cost[state] = None, 0
-        heapq.heappush(heap, (weight * h(s, state[1]), 0, -state[1], s, -1))
+        tick()
+        rest = h(s, state[1])
+        heapq.heappush(heap, (weight * rest, 0, -state[1], s, -1, rest))
     done: dict[_State, float] = {}
     expanded = opened = 0
     turn = problem.turn_cost
     while heap:
-        _, minus_g, minus_left, cell, before = heapq.heappop(heap)
+        _, minus_g, minus_left, cell, before, least = heapq.heappop(heap)
         left, g = -minus_left, -minus_g
         state = (cell, left, before)
-        if done.get(state, g + 1) <= g:
+        if done.get(state, math.inf) <= g:
             continue
         if not left and problem.end in (None, cell):
-            lower = g if weight <= 1 else min([g, *(h(c, -u) - m for _, m, u, c, _ in heap)])
+            lower = g if weight <= 1 else min(g, *(entry[-1] for entry in heap), math.inf)
             return Found(_trace(parent, state), lower, expanded, opened)
         if expanded == bound:
-            lower = min([g + h(cell, left), *(h(c, -u) - m for _, m, u, c, _ in heap)])
-            return Found(None, lower, expanded, opened)
+            return Found(None, min(least, *(entry[-1] for entry in heap), math.inf), expanded, opened)
         done[state] = g
-        if not expanded % 64:
-            tick()
+        tick()
         expanded += 1
         opened += len(board.near[cell])
         for j in board.near[cell]:
@@ -58,9 +59,10 @@ def astar(problem: Problem, bound: int = 200_000, weight: float = 1.0, tick: Cal
             if turn and before >= 0 and heading(board, before, cell) != heading(board, cell, j):
                 ahead += turn
             child = (j, further, cell if turn else -1)
-            if ahead < cost.get(child, ahead + 1):
+            if ahead < cost.get(child, math.inf):
                 cost[child], parent[child] = ahead, state
-                heapq.heappush(heap, (ahead + weight * h(j, further), -ahead, -further, *child[::2]))
+                rest = h(j, further)
+                heapq.heappush(heap, (ahead + weight * rest, -ahead, -further, *child[::2], ahead + rest))
     raise AssertionError("a connected map has a walk")
 
 

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import shortest_path
 
 MOVES = {"N": (-1, 0), "E": (0, 1), "S": (1, 0), "W": (0, -1)}
 Cell = tuple[int, int]
+_DEAREST = 10**6
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,6 @@ class Board:
         graph = csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
         return shortest_path(graph, unweighted=True).astype(int).tolist()
 
-    def number(self, cell: Cell) -> int:
-        return self.cells.index(cell)
-
 
 @dataclass(frozen=True)
 class Problem:
@@ -64,7 +62,10 @@ def make_problem(dig: Any, start: Any = None, end: Cell | None = None, turn_cost
       ValueError: for a map that is empty or falls into pieces (it names them), a start or end that is not a cell to dig, or
         a cost below 0.
     """
-    dig = np.asarray(dig)
+    try:
+        dig = np.asarray(dig)
+    except ValueError:
+        raise ValueError("map: got rows of different lengths; give booleans [rows, columns]") from None
     if dig.ndim != 2 or dig.dtype != bool:
         raise ValueError(f"map: got {dig.dtype} of shape {list(dig.shape)}; give booleans [rows, columns]")
     pieces = connected_pieces(dig)
@@ -79,26 +80,29 @@ def make_problem(dig: Any, start: Any = None, end: Cell | None = None, turn_cost
     cells = sorted(pieces[0])
     at = {cell: i for i, cell in enumerate(cells)}
     near = tuple(tuple(at[r + dr, c + dc] for dr, dc in MOVES.values() if (r + dr, c + dc) in at) for r, c in cells)
-    if not (np.isfinite(turn_cost) and turn_cost >= 0):
-        raise ValueError(f"turn_cost: got {turn_cost}; give what a change of heading costs in steps, 0 or more")
-    chosen = range(len(cells)) if start is None else [_index(at, "start", one) for one in _several(start)]
-    goal = None if end is None else _index(at, "end", end)
-    return Problem(Board(dig.shape, tuple(cells), near), tuple(dict.fromkeys(chosen)), goal, turn_cost)
+    if not (isinstance(turn_cost, (int, float, np.number)) and 0 <= turn_cost <= _DEAREST):
+        raise ValueError(f"turn_cost: got {turn_cost!r}; give what a change of heading costs in steps, 0 to {_DEAREST}")
+    chosen = range(len(cells)) if start is None else [_index(at, "start", one) for one in _several("start", start)]
+    goal = None
+    if end is not None:
+        ends = _several("end", end)
+        if len(ends) > 1:
+            raise ValueError(f"end: got {end!r}; give (row, column) of one cell to dig")
+        goal = _index(at, "end", ends[0])
+    return Problem(Board(dig.shape, tuple(cells), near), tuple(dict.fromkeys(chosen)), goal, float(turn_cost))
 
 
-def _several(start: Any) -> list[Any]:
+def _several(field: str, start: Any) -> list[Cell]:
     given = np.asarray(start)
     if given.ndim not in (1, 2) or given.shape[-1] != 2 or not given.size or given.dtype.kind not in "iu":
-        raise ValueError(f"start: got {start!r}; give (row, column) of a cell to dig, or several such")
+        raise ValueError(f"{field}: got {start!r}; give (row, column) of a cell to dig")
     return [tuple(cell) for cell in given.reshape(-1, 2).tolist()]
 
 
-def _index(at: dict[Cell, int], field: str, cell: Any) -> int:
-    try:
-        row, column = (int(x) for x in cell)
-        return at[row, column]
-    except (KeyError, TypeError, ValueError):
-        raise ValueError(f"{field}: got {cell}; give (row, column) of a cell to dig, such as {next(iter(at))}") from None
+def _index(at: dict[Cell, int], field: str, cell: Cell) -> int:
+    if cell not in at:
+        raise ValueError(f"{field}: got {cell}; give (row, column) of a cell to dig, such as {next(iter(at))}")
+    return at[cell]
 
 
 def connected_pieces(dig: np.ndarray) -> list[set[Cell]]:
@@ -147,7 +151,8 @@ def blocks_of(near: tuple[tuple[int, ...], ...]) -> list[Block]:
                 break
             low[parent] = min(low[parent], low[v])
             if low[v] >= depth[parent]:
-                own, edges = edges[cut:], edges[:cut]
+                own = edges[cut:]
+                del edges[cut:]
                 found.append(Block(tuple(sorted({x for e in own for x in e})), tuple(own)))
     return found
 

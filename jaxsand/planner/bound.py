@@ -20,7 +20,7 @@ R. The bound takes the path that saves most over closed parts; every term being 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 from jaxsand.planner.board import Block, Board, Hanging, blocks_of, hang
 
@@ -46,7 +46,8 @@ class _Part:
 def block_bound(board: Board, end: int | None = None) -> Bound:
     """The bound above, by the tool's cell and the cells left to dig (bits); with `end`, for walks that end there."""
     blocks = blocks_of(board.near)
-    parts = cache(lambda root: _parts(board, hang(blocks, root), root))
+    roots = max(16, 200_000 // len(board.cells))  # kept at a time: each takes as many bits as there are cells, squared
+    parts = lru_cache(roots)(lambda root: _parts(board, hang(blocks, root), root))
 
     def bound(cell: int, left: int) -> int:
         target = 0 if end is None or end == cell else 1 << end

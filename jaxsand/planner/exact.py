@@ -15,7 +15,7 @@ from typing import Any
 from jaxsand.planner.board import Block, Board, Hanging, Problem, blocks_of, hang
 from jaxsand.planner.plans import Found
 from jaxsand.planner.relaxed import FAR, rest_of
-from jaxsand.planner.sweepline import Ends, Step, Sweep, Tour, steps_of
+from jaxsand.planner.sweepline import Ends, OutOfTime, Step, Sweep, Tour, steps_of
 
 _Key = tuple[int, int, bool, int, tuple[tuple[int, int], ...]]
 
@@ -42,28 +42,41 @@ class Blocks:
         number = block.edges[0][0] * len(self.board.cells) + block.edges[0][1]
         key = (number, ends.gate, ends.from_gate, ends.count, tuple(sorted(ends.gains.items())) if ends.count else ())
         old = self.known.get(key)
-        if old and old.cost == old.lower_bound:
-            return old
-        if old and not width:
+        if width and old and old.cost == old.lower_bound:
             return old
         if number not in self.sweeps:
             self.sweeps[number] = steps_of(block, self.board.cells)
         steps = self.sweeps[number]
+        if not width and old:
+            return Tour((), old.lower_bound, old.lower_bound, 0)
         sweep = Sweep(block, steps, ends, rest_of(steps, ends, self.board.colour, tick))
         if not width:
             return Tour((), sweep.least, sweep.least, 0)
-        new = sweep.search(width, tick, old)
-        if new.cost == FAR:
-            raise _NothingFound
+        try:
+            new = sweep.search(width, tick, old)
+        except OutOfTime:
+            times, cost = (old.times, old.cost) if old else ((), FAR)
+            self.known[key] = Tour(times, cost, sweep.proven, 0)
+            raise
         self.states += new.states
         self.known[key] = new
+        if new.cost == FAR:
+            raise _NothingFound
         return new
+
+
+@dataclass(frozen=True)
+class _Swap:
+    """How often the edges of a block are taken."""
+
+    edges: tuple[tuple[int, int], ...]
+    times: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class _Saving:
     """What it saves if one end of the walk, or both, lie at a cell or in blocks below it, against closed walks everywhere;
-    and the tours that take the place of closed ones: nested pairs of a block's edges and how often each is taken."""
+    and the tours that take the place of closed ones, `_Swap`s in nested pairs."""
 
     value: int
     swaps: Any = ()
@@ -77,7 +90,7 @@ class _Part:
     """A block with all below it: its closed tour, what one end and both ends there save (None: not possible), and how far
     its figures may be from the truth."""
 
-    closed: tuple[Any, Any]
+    closed: _Swap
     cost: int
     one: _Saving | None
     two: _Saving | None
@@ -113,12 +126,14 @@ def _hung_from(
     """The walk with its other end, or with both, in `allowed`, and a lower bound."""
     least = len(blocks.board.cells) - 1
     parts: list[_Part] = []
+    hung = hang(blocks.blocks, root)
     try:
-        for hanging in hang(blocks.blocks, root):
+        for hanging in hung:
+            tick()
             parts.append(_part(blocks, hanging, parts, allowed, ends, width, tick))
     except _NothingFound:
-        return None, least
-    at_root = [part for part, hanging in zip(parts, hang(blocks.blocks, root), strict=True) if hanging.gate == root]
+        return None, _hung_from(root, blocks, allowed, ends, 0, tick)[1]
+    at_root = [part for part, hanging in zip(parts, hung, strict=True) if hanging.gate == root]
     one, two = _at(root, at_root, allowed)
     saving = two if ends == 2 else one
     if saving is None:
@@ -127,9 +142,9 @@ def _hung_from(
     if not width:
         return None, lower
     times: dict[tuple[int, int], int] = {}
-    for edges, often in [*(part.closed for part in parts), *_flat(saving.swaps)]:
-        times.update(zip(edges, often, strict=True))
-    return _trail(times, root), lower
+    for swap in [*(part.closed for part in parts), *_flat(saving.swaps)]:
+        times.update(zip(swap.edges, swap.times, strict=True))
+    return trail(times, root), lower
 
 
 def _at(cell: int, below: list[_Part], allowed: frozenset[int]) -> tuple[_Saving | None, _Saving | None]:
@@ -159,8 +174,8 @@ def _part(
     twos = [two for _, two in at.values() if two]
     if block.bridge:
         one = next(iter(at.values()))[0]
-        opened = _Saving(1 + one.value, ((block.edges, (1,)), one.swaps)) if one else None
-        return _Part((block.edges, (2,)), 2, opened, _best(twos), 0)
+        opened = _Saving(1 + one.value, (_Swap(block.edges, (1,)), one.swaps)) if one else None
+        return _Part(_Swap(block.edges, (2,)), 2, opened, _best(twos), 0)
     gains = {v: one.value for v, (one, _) in at.items() if one}
     closed = blocks.tour(block, Ends(gate, False, 0, {}), width, tick)
     slack = 0
@@ -169,7 +184,7 @@ def _part(
         nonlocal slack
         tour = blocks.tour(block, ends, width, tick)
         slack = max(slack, tour.cost - tour.lower_bound)
-        saving = _Saving(closed.cost - tour.cost, (block.edges, tour.times))
+        saving = _Saving(closed.cost - tour.cost, _Swap(block.edges, tour.times))
         for v in _odd(block, tour.times) - {gate}:
             below = at[v][0]
             assert below is not None
@@ -180,7 +195,7 @@ def _part(
     if count == 2 and len(gains) > 1:
         twos.append(save(Ends(gate, False, 2, gains)))
     slack = max(slack, closed.cost - closed.lower_bound)
-    return _Part((block.edges, closed.times), closed.cost, opened, _best(twos), slack)
+    return _Part(_Swap(block.edges, closed.times), closed.cost, opened, _best(twos), slack)
 
 
 def _odd(block: Block, times: tuple[int, ...]) -> set[int]:
@@ -191,19 +206,18 @@ def _odd(block: Block, times: tuple[int, ...]) -> set[int]:
     return odd
 
 
-def _flat(swaps: Any) -> list[tuple[Any, Any]]:
-    """The pairs (edges, times) of nested swaps. Edges are pairs of numbers, so their first entry's first is no tuple."""
+def _flat(swaps: Any) -> list[_Swap]:
     found, stack = [], [swaps]
     while stack:
         one = stack.pop()
-        if one and isinstance(one[1], (list, tuple)) and one[1] and isinstance(one[1][0], int):
+        if isinstance(one, _Swap):
             found.append(one)
         else:
             stack.extend(one)
     return found
 
 
-def _trail(times: dict[tuple[int, int], int], start: int) -> list[int]:
+def trail(times: dict[tuple[int, int], int], start: int) -> list[int]:
     """A walk that takes every edge as often as said (Hierholzer 1873), from an odd cell if there is one."""
     near: dict[int, list[int]] = {start: []}
     left: dict[tuple[int, int], int] = {}

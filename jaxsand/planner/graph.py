@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-_MOST_CELLS = 1 << 15
+MOST_CELLS = 1 << 15
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("near", "goal", "odd", "start"), meta_fields=())
@@ -40,8 +40,8 @@ def make_graph(near: np.ndarray, goal: np.ndarray, start: int) -> Graph:
       ValueError: for cells that cannot be coloured with two colours, or a goal that a walk from `start` cannot dig.
     """
     cells = len(near)
-    if cells > _MOST_CELLS:
-        raise ValueError(f"near: got {cells} cells; give at most {_MOST_CELLS}")
+    if cells > MOST_CELLS:
+        raise ValueError(f"near: got {cells} cells; give at most {MOST_CELLS}")
     colour = _colours(near, start, np.ones(cells, bool))
     if np.any((near >= 0) & (colour >= 0)[:, None] & (colour[near] == colour[:, None])):
         raise ValueError("near: got a cycle of odd length; give cells of a square grid")

@@ -15,8 +15,8 @@ ALPHA = 7.2
 
 
 def paper(problem: Problem, alpha: float = ALPHA, bound: int = 2_000_000) -> Found:
-    """The paper's A*; lower `alpha` is greedier. At 7.2 or above the walk found is proven shortest: h changes by at most 1 a
-    step, so f never falls along a path.
+    """The paper's A*; lower `alpha` is greedier. At 7.2 or above the walk found is proven shortest: with a weight of at most
+    1, and as h changes by at most 1 a step, f never falls along a path.
 
     Gives up after `bound` expansions. The lower bound is 0 where the search proves none.
     """

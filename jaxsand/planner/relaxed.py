@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from jaxsand.planner.sweepline import Ends, Step
 
 ALONE, EVEN, ODD = 0, 1, 2
-FAR = 1 << 14
+FAR = 1 << 28
 _WIDEST = 10  # cells of a frontier
-_ENTRIES = 1 << 27  # in all tables; two bytes each
+_ENTRIES = 1 << 26  # in all tables; four bytes each
 _JOINED, _FLIPPED = np.array([EVEN, EVEN, ODD]), np.array([ODD, ODD, EVEN])
 
 
@@ -39,16 +39,17 @@ class Tables:
 
 @dataclass(frozen=True)
 class Degrees:
-    """What is missing before each step: degrees of the cells to come by colour, the colours of the live slots; and what the
-    ends may take off."""
+    """What is missing before each step: degrees of the cells to come by colour; the colours of the live slots, and which of
+    them is a gate that must be odd; and what the ends may take off."""
 
     to_come: list[tuple[int, int]]
     colours: list[np.ndarray]
+    gates: list[np.ndarray]
     count: int
     most: int
 
     def bound(self, k: int, kinds: np.ndarray, spent: np.ndarray) -> np.ndarray:
-        missing = np.array([2, 0, 1], np.int32)[kinds]
+        missing = np.where(self.gates[k][:, None], np.array([1, 1, 0])[kinds], np.array([2, 0, 1])[kinds])
         dark = self.colours[k][:, None] == 1
         a = self.to_come[k][0] + np.where(dark, 0, missing).sum(0)
         b = self.to_come[k][1] + np.where(dark, missing, 0).sum(0)
@@ -69,7 +70,7 @@ def rest_of(steps: Sequence["Step"], ends: "Ends", colour: Sequence[int], tick: 
 
 
 def _tables(steps: Sequence["Step"], ends: "Ends", tick: Callable[[], None]) -> Tables:
-    rest: np.ndarray = np.full(ends.count + 1, FAR, np.int16)
+    rest: np.ndarray = np.full(ends.count + 1, FAR, np.int32)
     rest[ends.count] = 0
     costs = [rest]
     axes: list[int] = []  # the slot of each axis after the first
@@ -101,14 +102,15 @@ def _tables(steps: Sequence["Step"], ends: "Ends", tick: Callable[[], None]) -> 
 
 def _degrees(steps: Sequence["Step"], ends: "Ends", colour: Sequence[int]) -> Degrees:
     cells: dict[int, int] = {}
-    colours = [np.zeros(0, int)]
+    colours, gates = [np.zeros(0, int)], [np.zeros(0, bool)]
     for step in steps:
         cells[step.slot] = step.cell
         colours.append(np.array([colour[cells[s]] for s in step.live], int))
+        gates.append(np.array([ends.from_gate and cells[s] == ends.gate for s in step.live], bool))
     to_come = [(0, 0)]
     for step in reversed(steps):
         a, b = to_come[-1]
         need = 1 if step.cell == ends.gate and ends.from_gate else 2
         to_come.append((a + need, b) if colour[step.cell] == 0 else (a, b + need))
     most = max(ends.gains.values(), default=0) if ends.count else 0
-    return Degrees(to_come[::-1], colours, ends.count, max(most, 0))
+    return Degrees(to_come[::-1], colours, gates, ends.count, max(most, 0))

@@ -130,20 +130,22 @@ class Sweep:
     ends: Ends
     rest: Rest
     least: int = field(init=False)
+    proven: int = field(init=False)
 
     def __post_init__(self) -> None:
         none = np.zeros((0, 1), np.uint8)
-        self.least = int(self.rest.bound(0, none, np.zeros(1, np.uint8))[0])
+        self.least = self.proven = int(self.rest.bound(0, none, np.zeros(1, np.uint8))[0])
 
     def search(self, width: int, tick: Callable[[], None], old: Tour | None = None) -> Tour:
         """Deepens from the bound of the whole, or from what an `old` search proved, until a walk is found.
 
         At each depth few states are tried first: if they find a walk, it is shortest, and if none were left out, there is
-        none.
+        none. `proven` holds what is proven so far, also if `tick` raises.
         """
-        limit = proven = max(self.least, old.lower_bound if old else self.least)
+        limit = self.proven = max(self.least, old.lower_bound if old else self.least)
+        most = 2 * len(self.block.edges)  # every edge twice
         states, certain = 0, True
-        while limit < FAR and not (old and old.cost <= limit):
+        while limit <= most and not (old and old.cost <= limit):
             few = min(_FEW, width)
             found = self._pass(limit, few, tick)
             while found.times is None and not found.complete and few < width:
@@ -152,12 +154,13 @@ class Sweep:
                 found = self._pass(limit, few, tick)
             states += found.states
             if found.times is not None:
-                return Tour(found.times, found.cost, proven, states)
+                return Tour(found.times, found.cost, self.proven, states)
             certain = certain and found.complete
-            limit = found.next if certain else 2 * limit - proven + 2
             if certain:
-                proven = limit
-        return Tour(old.times if old else (), old.cost if old else FAR, proven, states)
+                limit = self.proven = found.next
+            else:
+                limit = max(limit + 1, min(2 * limit - self.proven + 2, most))
+        return Tour(old.times if old else (), old.cost if old else FAR, self.proven, states)
 
     def _pass(self, limit: int, width: int, tick: Callable[[], None]) -> "_Pass":
         slots = 1 + max(step.slot for step in self.steps)
@@ -185,9 +188,11 @@ class Sweep:
             state, over = state.take(keep), over[keep]
             unique = _cheapest(state, live)
             if len(unique) > width:
-                # By bound; among equals a fixed scatter, so that the states kept are of many kinds.
+                # By the bound and, since it takes two off wherever the walk falls apart, more for each part yet to be
+                # joined; among equals by a fixed scatter, so that the states kept are of many kinds.
+                parts = np.sum(state.hang[live][:, unique] == np.array(live)[:, None], axis=0)
                 scatter = (unique * 2654435761) % (1 << 32)
-                unique = np.sort(unique[np.lexsort((scatter, over[unique]))[:width]])
+                unique = np.sort(unique[np.lexsort((scatter, over[unique] + 4 * parts))[:width]])
                 complete = False
             state = state.take(unique)
             history.append((state.origin.astype(np.int32), state.choice.astype(np.uint8)))
