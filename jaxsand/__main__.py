@@ -46,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
         "--strokes", type=_count, metavar="N", help="strokes that --method search may use (a glyph's own number, else 6)"
     )
     p.add_argument("--pushes", type=_count, metavar="N", help="pushes that it may try (1000 a stroke)")
-    p.add_argument("--seed", type=_count, metavar="K", help="of its chance")
+    p.add_argument("--seed", type=_seed, metavar="K", help="for its random choices (0)")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
     p.add_argument("--surface", default="level", help="what lies there before: level, terrain or a .npy file (m)")
     p.add_argument("--relief-mm", type=_number, default=10.0, help="height range of --surface terrain")
@@ -122,6 +122,12 @@ def _neighbours(text: str) -> int | str:
 def _count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number of at least 1")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number of at least 0")
     return int(text)
 
 

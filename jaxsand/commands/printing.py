@@ -14,7 +14,8 @@ def read_cell(text: str | None, field: str = "start") -> tuple[int, int] | None:
     try:
         row, column = (int(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"{field}: got {text!r}; give row,column such as 3,3, or best") from None
+        best = ", or best" if field == "start" else ""
+        raise ValueError(f"{field}: got {text!r}; give row,column such as 3,3{best}") from None
     return row, column
 
 
