@@ -88,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
+    p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of the searches on sand (0)")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report and its figure")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_benchmark)

@@ -11,7 +11,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
     out = folder(options.out) if options.out else None
     from jaxsand.benchmark import bench, table
 
-    report = bench(options.what, options.batch, tell, options.grids)
+    report = bench(options.what, options.batch, tell, options.grids, options.seed)
     if out:
         from jaxsand.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
 

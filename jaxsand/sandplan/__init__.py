@@ -8,7 +8,7 @@ import numpy as np
 from jaxsand import task
 from jaxsand.rules import check_whole
 from jaxsand.sandplan.actions import Actions, Job, Lattice, Path, Steps, longest_stroke
-from jaxsand.sandplan.binary import binary_paths, binary_strokes
+from jaxsand.sandplan.binary import binary_hints, binary_paths
 from jaxsand.sandplan.reach import blade_size, least_distance
 from jaxsand.sandplan.rollouts import Effort, distance, replay
 from jaxsand.sandplan.steps import search_steps
@@ -91,10 +91,7 @@ def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Pat
     if isinstance(job.actions, Steps):
         walks = binary_paths(job.scene, job.height, job.goal, job.actions)
         return search_steps(job, walks[0] if walks else np.zeros((0, 2), int), budget, rng)
-    hints = binary_strokes(job.scene, job.height, job.goal)
-    length = np.hypot(*(hints[:, 2:] - hints[:, :2]).T)
-    allowed = hints[length <= longest_stroke(job.scene, job.actions)]
-    return search_strokes(job, allowed[:16], budget, rng)
+    return search_strokes(job, binary_hints(job), budget, rng)
 
 
 def _checked(scene: Scene, height: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

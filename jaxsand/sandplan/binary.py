@@ -5,9 +5,11 @@ from itertools import pairwise
 import numpy as np
 
 from jaxsand.planner import connected_pieces, plan
-from jaxsand.sandplan.actions import Steps, corners
+from jaxsand.sandplan.actions import Job, Steps, corners, longest_stroke
 from jaxsand.sandplan.reach import blade_size
 from jaxsand.scene import Scene
+
+_HINTS = 24
 
 
 def binary_paths(
@@ -39,13 +41,25 @@ def straight_runs(walk: np.ndarray) -> list[tuple[int, int]]:
     return [(a, b) for a, b in pairwise(turns) if b > a]
 
 
-def binary_strokes(scene: Scene, height: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def binary_strokes(
+    scene: Scene, height: np.ndarray, goal: np.ndarray, offset: tuple[int, int] = (0, 0), part: float = 0.5
+) -> np.ndarray:
     """The straight runs of the binary plan on blocks as wide as the blade: [n, 4] (m), in order."""
     steps = Steps(blade_cells(scene))
-    at = corners(scene, steps)
-    walks = binary_paths(scene, height, goal, steps)
+    at = corners(scene, steps, offset)
+    walks = binary_paths(scene, height, goal, steps, offset, part)
     runs = [[*at[tuple(walk[a])], *at[tuple(walk[b])]] for walk in walks for a, b in straight_runs(walk)]
     return np.array(runs).reshape(-1, 4)
+
+
+def binary_hints(job: Job) -> np.ndarray:
+    """Strokes [n, 4] (m) that the binary plan suggests, with its blocks at any offset: the longest that are allowed."""
+    cells = range(blade_cells(job.scene))
+    found = [binary_strokes(job.scene, job.height, job.goal, (row, column)) for row in cells for column in cells]
+    runs = np.unique(np.concatenate(found), axis=0)
+    length = np.hypot(*(runs[:, 2:] - runs[:, :2]).T)
+    order = np.argsort(-length, kind="stable")
+    return runs[order[length[order] <= longest_stroke(job.scene, job.actions)]][:_HINTS]
 
 
 def blade_cells(scene: Scene) -> int:

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 
 from jaxsand.sandplan.actions import Job, Path, Steps, corners, propose
-from jaxsand.sandplan.binary import binary_paths, binary_strokes, blade_cells, straight_runs
+from jaxsand.sandplan.binary import binary_hints, binary_paths, binary_strokes, blade_cells
 from jaxsand.sandplan.rollouts import Effort, distance, pushed, replay
 from jaxsand.sandplan.steps import follow_padded
 from jaxsand.sandplan.steps import in_layers as steps_in_layers
@@ -33,7 +33,8 @@ def binary(job: Job, budget: float, rng: np.random.Generator) -> Tried:
         walks = binary_paths(job.scene, job.height, job.goal, steps, offset, part)
         readings.append([at[tuple(np.concatenate([w, w[-1:]]).T if len(w) == 1 else w.T)] for w in walks])
         if steps is not job.actions:
-            readings.append([at[tuple(walk[[a, b]].T)] for walk in walks for a, b in straight_runs(walk)])
+            runs = binary_strokes(job.scene, job.height, job.goal, offset, part)
+            readings.append([run.reshape(2, 2) for run in runs])
     ends = [float(distance(_replayed(job, paths), job.goal)) for paths in readings]
     return readings[int(np.argmin(ends))], Effort(full=sum(len(path) - 1 for paths in readings for path in paths))
 
@@ -117,7 +118,7 @@ def random_walks(job: Job, budget: float, rng: np.random.Generator) -> Tried:
 
 
 def _of_layers(job: Job, budget: float, width: int, rng: np.random.Generator) -> Tried:
-    nodes, effort = in_layers(job, binary_strokes(job.scene, job.height, job.goal)[:16], budget, width, rng)
+    nodes, effort = in_layers(job, binary_hints(job), budget, width, rng)
     paths = [stroke.reshape(2, 2) for stroke in nodes.plans[0]]
     ends = [float(distance(replay(job.scene, job.height, paths[:n]), job.goal)) for n in range(len(paths) + 1)]
     return paths[: int(np.argmin(ends))], effort

@@ -14,7 +14,7 @@ _GRAIN = 1 / 20  # of the largest height to change: what maps are told apart by
 _TRIED = 8  # variants of a plan, the best by rough pushes, are pushed in full
 _WIDTH = 8  # nodes that a layer keeps
 _CHILDREN = 2  # of one node among them
-_PLANS = 3  # are improved at first, one at last
+_PLANS = 12  # strokes in all plans that are improved at first; one plan at last
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Nodes:
 def search_strokes(job: Job, hints: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
     """The best strokes found for a job, at a cost of about `budget` full pushes. `hints` [m, 4] are tried in every layer."""
     nodes, effort = in_layers(job, hints, _LAYERS * budget, _WIDTH, rng)
-    plan, more = improved(job, nodes.plans[:_PLANS], budget - effort.cost, rng)
+    plan, more = improved(job, nodes.plans[: max(1, _PLANS // job.strokes)], budget - effort.cost, rng)
     return [stroke.reshape(2, 2) for stroke in plan], effort + more
 
 
