@@ -94,7 +94,7 @@ def _on_task(chosen: SandTask, tell: Tell, per_stroke: int, seed: int) -> list[d
             "before": before * 1e3,
             "after": after * 1e3,
             "reduction": 1 - after / before,
-            "closer": 1 - found.after / best if name == _SEARCH else None,
+            "closer": (1 - found.after / best if best else 0.0) if name == _SEARCH else None,
             "lower_bound": found.lower_bound * 1e3,
             "estimate": found.estimate * 1e3,
             "gap": (after - found.lower_bound) * 1e3,
