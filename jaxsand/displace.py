@@ -18,7 +18,7 @@ from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
 from jaxsand.flux import stand
 from jaxsand.loop import repeat_until
 from jaxsand.sweep import Flow, sweep
-from jaxsand.tool import Blade, Pose, local
+from jaxsand.tool import Pose, local
 
 _EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]
@@ -32,9 +32,22 @@ class Job:
     bed: Bed
     x: jax.Array  # [1, W]
     y: jax.Array  # [H, 1]
-    tool: Blade
-    bottom: jax.Array  # []
+    tool: Any  # a Blade or a Wheel
+    bottom: jax.Array  # [], or [H, W] where it is not flat
     flow: Flow
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Hanging:
+    """A tool over the share `cover` of each cell, its bottom at height `bottom` [H, W] (m): there is room below it."""
+
+    cover: jax.Array
+    bottom: jax.Array
+
+    def rest(self, h: jax.Array, received: jax.Array) -> jax.Array:
+        below = jnp.minimum(received, jnp.where(h < self.bottom, self.bottom - h, 0))
+        return (1 - self.cover) * received + self.cover * below
 
 
 def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -46,9 +59,10 @@ def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[j
 
 
 def pass_on(
-    job: Job, share: Shares, free: jax.Array, h: jax.Array, lost: Lost, carried: jax.Array
+    job: Job, share: Shares, free: jax.Array | Hanging, h: jax.Array, lost: Lost, carried: jax.Array
 ) -> tuple[jax.Array, Lost, jax.Array]:
-    """Hands `carried` [H, W] on by one cell, the shares for the eight neighbours given; it rests where cells are `free`."""
+    """Hands `carried` [H, W] on by one cell, the shares for the eight neighbours given; it rests where cells are `free`, or
+    where there is room below a tool."""
     room = halo(jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype), 0.0)
     if job.bed.rim is not None:
         room = room + job.bed.rim.beyond
@@ -61,7 +75,7 @@ def pass_on(
         received = received + whole(job, s_there * at(source, -di, -dj)) * at(room)
         if job.bed.rim is not None and lost is not None:
             lost = lose(job.flow.quantum, lost, given * at(job.bed.rim.beyond, di, dj))
-    rest = whole(job, free * received)
+    rest = whole(job, free.rest(h, received) if isinstance(free, Hanging) else free * received)
     return h + (rest + kept), lost, received - rest
 
 
@@ -77,17 +91,24 @@ def shares(p: jax.Array, q: jax.Array) -> Shares:
 
 
 def radial(job: Job, pose: Pose) -> Shares:
-    """The shares for directions away from the blade's centre, in its proportions; shorter within a cell of the centre."""
+    """The shares for directions away from the blade's centre, in its proportions."""
     along, across = local(pose, job.x, job.y)
     s, n = along / job.tool.thickness**2, across / job.tool.width**2
-    p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
+    return outwards(job, pose, s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos)
+
+
+def outwards(job: Job, pose: Pose, p: jax.Array, q: jax.Array) -> Shares:
+    """The shares for a field of directions (p along columns, q along rows) of any length; shorter within a cell of the
+    tool's centre."""
     size = jnp.maximum(jnp.abs(p), jnp.abs(q))
     cells = jnp.maximum(jnp.abs(job.x - pose.x), jnp.abs(job.y - pose.y)) / job.bed.spacing
     scale = jnp.where(size > 0, jnp.minimum(cells, 1) / jnp.where(size > 0, size, 1), 0)
     return shares(p * scale, q * scale)
 
 
-def spread(job: Job, share: Shares, free: jax.Array, h: jax.Array, lost: Lost, carried: jax.Array) -> tuple[jax.Array, Lost]:
+def spread(
+    job: Job, share: Shares, free: jax.Array | Hanging, h: jax.Array, lost: Lost, carried: jax.Array
+) -> tuple[jax.Array, Lost]:
     """Hands `carried` on until all of it rests."""
     rows, columns = h.shape
     (h, lost, carried), _ = repeat_until(_at_rest, _onward, rows + columns, (job, share, free), (h, lost, carried))

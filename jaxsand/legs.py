@@ -15,7 +15,7 @@ from jaxsand.grid import centres
 from jaxsand.rules import Outcome
 from jaxsand.scene import Scene
 from jaxsand.sweep import Flow
-from jaxsand.tool import NoTool, Pose, local
+from jaxsand.tool import NoTool, Pose, extent, local, lowest, reach
 from jaxsand.window import Window
 
 
@@ -64,8 +64,8 @@ def along_legs(
     intact, broken = mark(scene, height)
     # Of a path or a tool that is not finite nothing is used; the blade hangs above everything.
     tool = jax.tree.map(lambda leaf: jnp.where(usable, leaf, bed.spacing), scene.tool)
-    bottom = jnp.where(usable, -jnp.asarray(scene.tool.depth), jnp.inf)
-    scale = 4 * (largest(intact) + jnp.where(usable, jnp.abs(bottom), 0))
+    bottom = jnp.where(usable, lowest(scene.tool), jnp.inf)
+    scale = 4 * (largest(intact) + jnp.where(usable, extent(scene.tool), 0))
     flow = Flow(jnp.asarray(rate), quantum(scale))
     job = Job(bed, *centres(scene.grid, height.dtype), tool, bottom, flow)
     lost = nothing_lost(bed, height)
@@ -104,9 +104,9 @@ def over_the_map(scene: Scene, job: Job, pose: Pose, length: jax.Array) -> tuple
     """The part of a leg on which the blade touches the map: the pose where it starts, and its length."""
     dx = job.bed.spacing
     along = corners(scene, job, pose)
-    reach = job.tool.thickness / 2 + dx
-    first = jnp.clip(along[0] - reach, 0, length)
-    last = jnp.clip(along[1] + reach, first, length)
+    far = reach(job.tool) + dx
+    first = jnp.clip(along[0] - far, 0, length)
+    last = jnp.clip(along[1] + far, first, length)
     return Pose(pose.x + first * pose.cos, pose.y + first * pose.sin, pose.cos, pose.sin), last - first
 
 

@@ -60,11 +60,11 @@ def _leg(scene: Scene, push: SteppedPush, job: Job, pose: Pose, length: jax.Arra
     # make_scene holds the thickness below the map's diagonal, so twice the diagonal is enough.
     bound = math.ceil((2 * math.hypot(*scene.grid.shape) + 3) / push.substep)
     params = (scene, job, start, length)
-    state, _ = repeat_until(partial(_arrived, push), partial(_advance, push), bound, params, state)
+    state, _ = repeat_until(partial(arrived, push), partial(_advance, push), bound, params, state)
     return state
 
 
-def _arrived(push: SteppedPush, params: Any, k: jax.Array, _: Any) -> jax.Array:
+def arrived(push: SteppedPush, params: Any, k: jax.Array, _: Any) -> jax.Array:
     _, job, _, length = params
     return k * push.substep * job.bed.spacing >= length
 
@@ -93,7 +93,7 @@ def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> Stat
         h, lost = settle_around(job, flow, push.sweeps, after, h + carried, lost)
         return h, lost, swept
 
-    return _in_window(scene, job, pose, state, move)
+    return in_window(scene, job, pose, state, move)
 
 
 def _lower(scene: Scene, push: SteppedPush, job: Job, pose: Pose, before: Pose | None, state: State) -> State:
@@ -110,10 +110,10 @@ def _lower(scene: Scene, push: SteppedPush, job: Job, pose: Pose, before: Pose |
             h, lost = settle_around(job, flow, math.ceil(push.sweeps / push.substep), cover, h, lost)
         return h, lost, cover
 
-    return _in_window(scene, job, pose, state, move)
+    return in_window(scene, job, pose, state, move)
 
 
-def _in_window(scene: Scene, job: Job, pose: Pose, state: State, move: Callable) -> State:
+def in_window(scene: Scene, job: Job, pose: Pose, state: State, move: Callable) -> State:
     """Applies `move` to the whole map, or to the block of it around the tool."""
     h, lost, moved = state
     if not isinstance(scene.window, Window):

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsand.grid import Grid, Neighbours
 from jaxsand.material import DRY_SAND, Material
-from jaxsand.tool import Blade, NoTool
+from jaxsand.tool import Blade, Grousers, NoTool, Smooth, Wheel
 from jaxsand.walls import Closed, Draining, Open, Walls
 from jaxsand.window import Whole, Window
 
@@ -25,7 +25,7 @@ class Scene:
     walls: Open | Walls = field(default_factory=Open)
     edge: Closed | Draining = field(default_factory=Closed)
     window: Whole | Window = field(default_factory=Whole)
-    tool: NoTool | Blade = field(default_factory=NoTool)
+    tool: NoTool | Blade | Wheel = field(default_factory=NoTool)
 
 
 def make_scene(
@@ -34,7 +34,7 @@ def make_scene(
     repose_angle: jax.typing.ArrayLike = DRY_SAND.repose_angle,
     neighbours: Neighbours = 8,
     *,
-    tool: NoTool | Blade | None = None,
+    tool: NoTool | Blade | Wheel | None = None,
     walls: Open | Walls | None = None,
     edge: Closed | Draining | None = None,
     window: Whole | Window | None = None,
@@ -238,5 +238,44 @@ def _check_tool(tool: Any, grid: Grid) -> None:
                 f"tool.thickness: got {tool.thickness!r} m, more than the map's diagonal; "
                 "give lengths in metres, or enlarge the map"
             )
+    elif isinstance(tool, Wheel):
+        _check_wheel(tool, grid)
     elif not isinstance(tool, NoTool):
-        raise ValueError(f"tool: got {tool!r}; give NoTool() or Blade(width, thickness, depth)")
+        raise ValueError(
+            f"tool: got {tool!r}; give NoTool(), Blade(width, thickness, depth) or Wheel(radius, width, sinkage)"
+        )
+
+
+def _check_wheel(wheel: Wheel, grid: Grid) -> None:
+    for name in ("radius", "width", "sinkage"):
+        _positive(f"tool.{name}", getattr(wheel, name), f"give the wheel's {name} in metres")
+    _finite("tool.slip_angle", wheel.slip_angle, "give the angle from the wheel's plane to its way in rad")
+    radius, width, sinkage, slip, dx = map(
+        concrete, (wheel.radius, wheel.width, wheel.sinkage, wheel.slip_angle, grid.spacing)
+    )
+    if sinkage is not None and radius is not None and sinkage > radius:
+        raise ValueError(f"tool.sinkage: got {wheel.sinkage!r} m, deeper than the axle; give at most the radius")
+    if slip is not None and abs(slip) > math.pi / 2 * (1 + 1e-6):
+        raise ValueError(
+            f"tool.slip_angle: got {wheel.slip_angle!r} rad; give -pi/2 to pi/2: for degrees use math.radians(45)"
+        )
+    if dx is not None:
+        for name, extent in (("radius", radius), ("width", width)):
+            if extent is not None and extent < dx * (1 - 1e-6):
+                raise ValueError(
+                    f"tool.{name}: got {getattr(wheel, name)!r} m, less than a cell of {grid.spacing!r} m; "
+                    "enlarge the wheel or refine the grid"
+                )
+            if extent is not None and extent > dx * max(2, math.hypot(*grid.shape)):
+                raise ValueError(
+                    f"tool.{name}: got {getattr(wheel, name)!r} m, more than the map's diagonal; "
+                    "give lengths in metres, or enlarge the map"
+                )
+    if isinstance(wheel.grousers, Grousers):
+        for name in ("height", "fill", "spin"):
+            value = concrete(getattr(wheel.grousers, name))
+            if value is not None and not (value.ndim == 0 and np.isfinite(value) and value >= 0):
+                got = _short(getattr(wheel.grousers, name))
+                raise ValueError(f"tool.grousers.{name}: got {got}; it must be one finite number of 0 or more")
+    elif not isinstance(wheel.grousers, Smooth):
+        raise ValueError(f"tool.grousers: got {wheel.grousers!r}; give Smooth() or Grousers(height, fill, spin)")

@@ -10,16 +10,26 @@ import numpy as np
 from jaxsand.batch import on_all_cores, wide_vectors
 from jaxsand.legs import Pushed
 from jaxsand.push import SteppedPush, push_along
+from jaxsand.roll import roll_along
 from jaxsand.rules import Outcome, Stop, as_batch, check_chunk, check_rate, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.schemes import Scheme
 from jaxsand.settling import Settled, relax, relax_batch
+from jaxsand.split import SplitPush, push_split
 from jaxsand.swath import SwathPush, push_swath
-from jaxsand.tool import Pose
+from jaxsand.tool import Blade, NoTool, Pose, Wheel
 from jaxsand.window import Whole
 
-Push = SteppedPush | SwathPush
-_PUSHES: dict[type, Any] = {SteppedPush: push_along, SwathPush: push_swath}
+Push = SteppedPush | SwathPush | SplitPush
+_PUSHES: dict[tuple[type, type], Any] = {
+    (Blade, SteppedPush): push_along,
+    (Blade, SwathPush): push_swath,
+    (Wheel, SteppedPush): roll_along,
+    (Wheel, SplitPush): push_split,
+    (NoTool, SteppedPush): push_along,
+    (NoTool, SwathPush): push_along,
+    (NoTool, SplitPush): push_along,
+}
 
 
 @jax.tree_util.register_dataclass
@@ -179,14 +189,25 @@ def check(result: Settled | Pushed) -> None:
 _Rules = tuple[Push, Scheme, Stop]
 
 
+def _way(scene: Scene, push: Push) -> Any:
+    """How the push moves the scene's tool."""
+    return _PUSHES[type(scene.tool), type(push)]
+
+
 def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, _Rules]:
     push = SteppedPush() if push is None else push
     if not isinstance(push, Push):
-        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps) or SwathPush()")
+        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
+    if (type(scene.tool), type(push)) not in _PUSHES:
+        other = "SwathPush() is for a Blade" if isinstance(push, SwathPush) else "SplitPush() is for a Wheel"
+        raise ValueError(
+            f"push: got {type(push).__name__} for a {type(scene.tool).__name__}; {other}, SteppedPush() for both"
+        )
     if isinstance(push, SteppedPush) and not 0 < push.substep <= 1:
         raise ValueError(f"push.substep: got {push.substep!r}; give a part of a spacing, above 0 and at most 1")
-    check_whole("push.sweeps", push.sweeps, 0)
-    check_rate(scene, "push.rate", push.rate)
+    if not isinstance(push, SplitPush):
+        check_whole("push.sweeps", push.sweeps, 0)
+        check_rate(scene, "push.rate", push.rate)
     scheme, stop = check_rule(scene, scheme, stop)
     scene, height = fit(scene, height)
     return scene, height, cast((push, scheme, stop), height.dtype)
@@ -215,7 +236,7 @@ def _itself(height: jax.Array) -> jax.Array:
 @partial(jax.jit, static_argnames="record")
 def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, record: Any = None) -> tuple[Shaped, Any]:
     push, scheme, stop = rules
-    pushed, frames = _PUSHES[type(push)](scene, height, path, push, record)
+    pushed, frames = _way(scene, push)(scene, height, path, push, record)
     return _both(pushed, relax(scene, pushed.height, scheme, stop)), frames
 
 
@@ -226,7 +247,7 @@ def _both(pushed: Pushed, settled: Settled) -> Shaped:
 
 @jax.jit
 def _act(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules) -> Pushed:
-    return _PUSHES[type(rules[0])](scene, height, path, rules[0])[0]
+    return _way(scene, rules[0])(scene, height, path, rules[0])[0]
 
 
 @jax.jit
@@ -240,7 +261,7 @@ def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: _Rules)
 
 def _step_chunks(fixed: tuple[Scene, _Rules], maps_and_paths: tuple[jax.Array, jax.Array], *, chunk: int) -> Shaped:
     scene, (push, scheme, stop) = fixed
-    act_on = partial(_PUSHES[type(push)], scene, push=push)
+    act_on = partial(_way(scene, push), scene, push=push)
     pushed = jax.lax.map(lambda pair: act_on(*pair)[0], maps_and_paths, batch_size=chunk)
     return _both(pushed, relax_batch((scene, scheme, stop, Whole()), pushed.height, chunk=chunk))
 

@@ -43,7 +43,7 @@ _DOWN = 0.6  # how far from the blade's ends that lies
 _INNER = 1.3  # how far it is strewn
 _BEHIND = 0.2  # of the sand under the blade when it is lowered: what leaves behind it
 _ASIDE = 0.38  # and to its sides
-_ROOM = 0.25  # with less room than this part of a profile's own, sand is held back
+ROOM = 0.25  # with less room than this part of a profile's own, sand is held back
 
 
 @jax.tree_util.register_dataclass
@@ -96,22 +96,22 @@ def _sweep_out(  # noqa: PLR0915
 
     area = jnp.sum(cover * sand)
     depth = jnp.maximum(jnp.sum(taken) / jnp.where(area > 0, area, 1), dx / 1000)
-    mu = _drop(job, (cover + 1e-6 * under) * sand) / dx
+    mu = typical_drop(job, (cover + 1e-6 * under) * sand) / dx
     reach = jnp.sqrt(tool.width * depth / mu)
     lag = _LAG * (side + math.pi / 6 * reach)
     near, reach = jnp.maximum(_NEAR * reach, dx / 2), jnp.maximum(reach, dx / 2)
     s, n = local(pose, job.x, job.y)
     end = half + length
     berm = _berms(n, side, near, reach, dx) * sand
-    heap = _wedge(s - end, _THROW * reach, dx) * _across(n, side, _FLARE * reach, dx) * sand
+    heap = wedge(s - end, _THROW * reach, dx) * _across(n, side, _FLARE * reach, dx) * sand
     back_reach = jnp.maximum(jnp.sqrt(tool.thickness * depth / mu), dx / 2)
-    behind = _wedge(-half - s, back_reach, dx) * _across(n, side, 0.0, dx) * sand
+    behind = wedge(-half - s, back_reach, dx) * _across(n, side, 0.0, dx) * sand
     heap_width = (2 * side + _FLARE * reach) / dx
 
     # Where the blade is lowered, some sand leaves behind it and to its sides.
     start, back_width = jnp.sum(first), 2 * side / dx
     back_room = jnp.sum(behind) / back_width
-    back = _BEHIND * jnp.minimum(back_room / _ROOM, 1)
+    back = _BEHIND * jnp.minimum(back_room / ROOM, 1)
 
     # Slices of the stroke, of a spacing or more each; a cell belongs to two of them.
     least, _ = corners(scene, job, pose)
@@ -121,19 +121,19 @@ def _sweep_out(  # noqa: PLR0915
     thick = jnp.maximum(dx, (end - origin) / (count - 1))
     place = origin + slices * thick
     at = (s - origin) / thick
-    hat = _hat(at.reshape(1, -1), slices)
-    room = hat @ berm.ravel() * (dx / thick)
+    hats = hat(at.reshape(1, -1), slices)
+    room = hats @ berm.ravel() * (dx / thick)
     onward = taken - first * (back + _ASIDE)
-    ahead = hat @ onward.ravel()
+    ahead = hats @ onward.ravel()
     ahead = ahead.at[-1].add(jnp.sum(onward * jnp.clip(at - (count - 1), 0, 1)))  # what sticks out of the last slice
     beyond, heap_beyond = _over_rim(scene, job, pose, place, side, reach, end)
-    open_ = jnp.minimum((room + beyond) / _ROOM, 1)
+    open_ = jnp.minimum((room + beyond) / ROOM, 1)
     along = jnp.clip(place + thick / 2, -half, half) - jnp.clip(place - thick / 2, -half, half)
     aside = _ASIDE * start * along / (2 * half)
     # What the blade covers before it moves is taken up as it moves off.
     before = jnp.where(place < half, ahead, 0)
     early = jnp.sum(before) + jnp.sum(onward * jnp.clip(-at, 0, 1)) + _ASIDE * start - jnp.sum(aside * open_)
-    ahead = ahead - before + early * _hat(jnp.clip((half - origin) / thick, 0, count - 1)[None, None], slices)[:, 0]
+    ahead = ahead - before + early * hat(jnp.clip((half - origin) / thick, 0, count - 1)[None, None], slices)[:, 0]
 
     # The heap's balance, slice by slice.
     step = jnp.clip(place + thick / 2, half, end) - jnp.clip(place - thick / 2, half, end)
@@ -145,9 +145,9 @@ def _sweep_out(  # noqa: PLR0915
     left = left + aside * open_
     density = left / jnp.where(room + beyond > 0, room + beyond, 1)
     heap_room = jnp.sum(heap) / heap_width
-    heap_density = heaped / jnp.maximum(heap_room + heap_beyond, _ROOM)
-    put = berm * (density * (dx / thick) @ hat).reshape(h.shape) + heap * (heap_density / heap_width)
-    put = put + behind * (_BEHIND * start / back_width / jnp.maximum(back_room, _ROOM))
+    heap_density = heaped / jnp.maximum(heap_room + heap_beyond, ROOM)
+    put = berm * (density * (dx / thick) @ hats).reshape(h.shape) + heap * (heap_density / heap_width)
+    put = put + behind * (_BEHIND * start / back_width / jnp.maximum(back_room, ROOM))
     kept = heaped - heap_density * (heap_room + heap_beyond)
     last = taken * (jnp.exp((jnp.minimum(s, end) - end) / lag) + 1e-6)
     put = whole(job, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1)))
@@ -156,10 +156,10 @@ def _sweep_out(  # noqa: PLR0915
         gone = jnp.sum(density * beyond) + heap_density * heap_beyond
         over = whole(job, taken * (gone / jnp.where(every > 0, every, 1)))
         lost, taken = lose(job.flow.quantum, lost, over), taken - over
-    return h + _complete(job, taken, put), lost
+    return h + complete(job, taken, put), lost
 
 
-def _drop(job: Job, weight: jax.Array) -> jax.Array:
+def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
     """The largest stable step, its mean by weight where it differs from cell to cell."""
     drop = job.bed.drop
     if not drop.ndim:
@@ -172,11 +172,11 @@ def _berms(n: jax.Array, side: jax.Array, near: jax.Array, reach: jax.Array, dx:
     """Both berms' profile across the stroke, with what has slid back into the trench."""
     into = jnp.minimum(_INTO * reach / (2 * side), 0.8)
     inner = jnp.minimum(_INNER * reach, side)
-    outside = _wedge(jnp.abs(n) - side - _GAP * reach, near, dx) * (1 - into) / 2
-    return outside + _wedge(jnp.abs(jnp.abs(n) - jnp.maximum(side - _DOWN * reach, 0)), inner, dx) * into / 2
+    outside = wedge(jnp.abs(n) - side - _GAP * reach, near, dx) * (1 - into) / 2
+    return outside + wedge(jnp.abs(jnp.abs(n) - jnp.maximum(side - _DOWN * reach, 0)), inner, dx) * into / 2
 
 
-def _complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:
+def complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:
     """What is put down, and on its highest cell what the cuts left over; adds up to what was taken, exactly."""
     # The counts fit their integers or wrap around; their sum is right, since what is left over is small.
     quanta = jnp.round(lax.stop_gradient(taken - put) / job.flow.quantum)
@@ -215,12 +215,12 @@ def _over_rim(
     return (out(place, off) + out(place, -off)) / 2, jnp.mean(jnp.stack(heap))
 
 
-def _hat(at: jax.Array, slices: jax.Array) -> jax.Array:
+def hat(at: jax.Array, slices: jax.Array) -> jax.Array:
     """How much of a place belongs to each slice [k, ...]."""
     return jnp.maximum(1 - jnp.abs(at - slices[:, None]), 0)
 
 
-def _wedge(u: jax.Array, reach: jax.Array, dx: jax.Array) -> jax.Array:
+def wedge(u: jax.Array, reach: jax.Array, dx: jax.Array) -> jax.Array:
     """The mean over a spacing around u of a wedge on [0, reach] that falls to 0; they add up to 1."""
 
     def area(u: jax.Array) -> jax.Array:

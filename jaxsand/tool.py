@@ -1,6 +1,6 @@
 """Tools: their geometry, and how much of each cell they cover."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,60 @@ class Blade:
     width: jax.Array | float = 0.02
     thickness: jax.Array | float = 0.015
     depth: jax.Array | float = 0.0075
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Smooth:
+    """A rim without grousers, or a wheel that is towed without turning (neutral)."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Grousers:
+    """Bars across a wheel's rim, `height` (m) high, that carry sand to behind the wheel.
+
+    To a metre of travel they carry spin * width * height * fill (m^3); `fill` is the share of the space between them that
+    sand takes up, `spin` the rim's speed over the wheel's: 1 / (1 - i) for a wheel driven at the slip ratio i.
+    """
+
+    height: jax.Array | float = 0.005
+    fill: jax.Array | float = 0.1
+    spin: jax.Array | float = 1.0
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Wheel:
+    """A wheel towed or driven at a fixed sinkage, its plane at an angle to its way.
+
+    `radius`, `width` and `sinkage` in m; the lowest point of the rim is at height -sinkage. `slip_angle` (rad) turns from
+    the wheel's plane to its way, counter-clockwise: at pi/2 the wheel is dragged sideways, to its left. The defaults are
+    those of arXiv:1908.02745.
+    """
+
+    radius: jax.Array | float = 0.048
+    width: jax.Array | float = 0.05
+    sinkage: jax.Array | float = 0.015
+    slip_angle: jax.Array | float = 0.0
+    grousers: Smooth | Grousers = field(default_factory=Smooth)
+
+
+def lowest(tool: Blade | Wheel) -> jax.Array:
+    """The height of the tool's lowest point (m)."""
+    return -jnp.asarray(tool.sinkage if isinstance(tool, Wheel) else tool.depth)
+
+
+def extent(tool: Blade | Wheel) -> jax.Array:
+    """How high or low the tool can bring sand (m), in order of magnitude; sets the precision of a push."""
+    return jnp.asarray(tool.radius) if isinstance(tool, Wheel) else jnp.abs(jnp.asarray(tool.depth))
+
+
+def reach(tool: Blade | Wheel) -> jax.Array:
+    """How far from its centre the tool reaches along its way (m), at most."""
+    if isinstance(tool, Wheel):
+        return jnp.hypot(tool.radius, jnp.asarray(tool.width) / 2)
+    return jnp.asarray(tool.thickness) / 2
 
 
 @jax.tree_util.register_dataclass
@@ -54,9 +108,29 @@ def coverage(
     along, across = local(pose, x, y)
     half = jnp.asarray(blade.thickness) / 2
     side = jnp.asarray(blade.width) / 2
-    return _interval(along, -half, half + ahead, spacing) * _interval(across, -side, side, spacing)
+    return interval(along, -half, half + ahead, spacing) * interval(across, -side, side, spacing)
 
 
-def _interval(s: jax.Array, start: jax.Array, stop: jax.Array, spacing: jax.Array) -> jax.Array:
+def interval(s: jax.Array, start: jax.Array, stop: jax.Array, spacing: jax.Array) -> jax.Array:
     """The share of [s - dx/2, s + dx/2] that lies in [start, stop]."""
     return jnp.clip((s - start) / spacing + 0.5, 0.0, 1.0) - jnp.clip((s - stop) / spacing + 0.5, 0.0, 1.0)
+
+
+def wheel_frame(wheel: Wheel, pose: Pose, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Coordinates in the wheel's frame (m): along its plane and along its axle, to the left."""
+    along, across = local(pose, x, y)
+    cos, sin = jnp.cos(wheel.slip_angle), jnp.sin(wheel.slip_angle)
+    return along * cos - across * sin, along * sin + across * cos
+
+
+def rim(wheel: Wheel, pose: Pose, x: jax.Array, y: jax.Array, spacing: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The share of each cell, 0 to 1, that the wheel stands or hangs over, and the height of its rim there (m).
+
+    The rim's lower half, -sinkage + r - sqrt(r^2 - a^2) at the distance a from the axle; coverage as for a blade.
+    """
+    a, c = wheel_frame(wheel, pose, x, y)
+    r, side = jnp.asarray(wheel.radius), jnp.asarray(wheel.width) / 2
+    cover = interval(a, -r, r, spacing) * interval(c, -side, side, spacing)
+    inside = jnp.abs(a) < 0.999 * r
+    square = jnp.where(inside, r * r - a * a, 0.002 * r * r)
+    return cover, r - wheel.sinkage - jnp.sqrt(square)

@@ -1,0 +1,189 @@
+"""The wheel's ruts: trenches simulated over slip angles and sinkages, beside what is known of them.
+
+The experiment of arXiv:1908.02745, section IV: a wheel is towed across level sand, and the section it leaves half-way is
+compared with the closed form and with the exact relaxation (trench.py), and with a user's scans (scans.py).
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.batch import cores
+from jaxsand.push import SteppedPush
+from jaxsand.rules import Outcome
+from jaxsand.scans import Scan, compare, measured_profile
+from jaxsand.scene import make_scene
+from jaxsand.sim import Push, step
+from jaxsand.split import SplitPush
+from jaxsand.tool import Wheel
+from jaxsand.trench import Pass, Profile, closed_form, relaxed
+from jaxsand.window import Window
+
+Tell = Callable[[str], None]
+Trench = tuple[float, float]  # slip angle (degrees), sinkage (mm)
+ANGLES = (0.0, 22.5, 45.0, 67.5, 90.0)
+SINKAGES = (5.0, 15.0, 25.0)
+TRENCHES: tuple[Trench, ...] = tuple((beta, sinkage) for sinkage in SINKAGES for beta in ANGLES)
+RULES: dict[str, Push] = {"own": SteppedPush(), "split": SplitPush()}
+FIGURES = ("mean_abs_mm", "median_abs_mm", "depth_error_mm")
+# arXiv:1908.02745, Table I: its simulator over 14 trenches, against the closed form and against LIDAR scans (mm).
+PAPER = {
+    "closed-form": dict(zip(FIGURES, (1.1, 0.4, 0.6), strict=True)),
+    "measured": dict(zip(FIGURES, (2.2, 1.7, 0.9), strict=True)),
+    "closed-form mean by angle": dict(zip(ANGLES, (0.5, 1.6, 1.7, 1.2, 0.4), strict=True)),
+    "closed-form mean by sinkage": dict(zip(SINKAGES, (0.4, 0.6, 2.2), strict=True)),
+}
+_WIDE, _BEFORE, _LENGTH, _AFTER = 0.32, 0.1, 1.0, 0.14  # m: across the way; along it
+_AROUND = 0.28  # m of the way that are computed at a time
+_APART = 0.05  # m between the sections that tell how steady the trench is
+
+
+@dataclass(frozen=True)
+class Rut:
+    """The section that a wheel left half-way, the mean distance (m) of that from the section 5 cm earlier, and the cost."""
+
+    profile: Profile
+    unsteady: float
+    sweeps: int
+    outcome: Outcome
+    seconds: float
+
+
+def simulate(trench: Trench, spacing: float, push: Push) -> Rut:
+    """Tows the paper's wheel one metre over level sand on cells of `spacing` (m), and takes the section half-way.
+
+    Its way runs over the middle of a row of cells. The sand is computed in a window that follows the wheel, and settles
+    everywhere at the end.
+    """
+    shape = round(_WIDE / spacing) // 2 * 2 + 1, round((_BEFORE + _LENGTH + _AFTER) / spacing)
+    window = Window((shape[0], min(round(_AROUND / spacing), shape[1])), math.inf)
+    wheel = Wheel(sinkage=trench[1] * 1e-3, slip_angle=math.radians(trench[0]))
+    scene = make_scene(shape, spacing, tool=wheel, window=window)
+    middle = shape[0] * spacing / 2
+    stroke = np.array([_BEFORE, middle, _BEFORE + _LENGTH, middle])
+    began = time.perf_counter()
+    shaped = jax.block_until_ready(step(scene, jnp.zeros(shape, jnp.float32), stroke, push=push))
+    seconds = time.perf_counter() - began
+    # Left of the way, where y is larger, is the section's left.
+    across = (np.arange(shape[0]) - shape[0] // 2) * spacing
+
+    def section(along: float) -> Profile:
+        return Profile(across, np.asarray(shaped.height, float)[::-1, int(along / spacing)])
+
+    half, earlier = section(_BEFORE + _LENGTH / 2), section(_BEFORE + _LENGTH / 2 - _APART)
+    return Rut(
+        half,
+        float(np.abs(half.z - earlier.z).mean()),
+        int(shaped.sweeps),
+        Outcome(int(shaped.outcome)),
+        seconds,
+    )
+
+
+def simulate_all(trenches: Iterable[Trench], spacing: float, push: Push, tell: Tell = lambda _: None) -> dict[Trench, Rut]:
+    """`simulate` for many trenches, on all cores."""
+    trenches = list(trenches)
+
+    def one(trench: Trench) -> Rut:
+        tell(f"wheel at {trench[0]:g} degrees, {trench[1]:g} mm, spacing {spacing * 1e3:g} mm")
+        return simulate(trench, spacing, push)
+
+    first = one(trenches[0])  # compiles
+    with ThreadPoolExecutor(cores()) as pool:
+        return {trenches[0]: first} | dict(zip(trenches[1:], pool.map(one, trenches[1:]), strict=True))
+
+
+def errors(profile: Callable, deepest: float, reference: Profile) -> dict[str, float]:
+    """Mean and median distance, every 0.5 mm between the reference's outer toes widened by 10 mm, and the difference of the
+    deepest points (mm)."""
+    x = np.arange(reference.toes[0] - 0.01, reference.toes[1] + 0.01, 5e-4)
+    apart = np.abs(profile(x) - reference(x)) * 1e3
+    figures = float(apart.mean()), float(np.median(apart)), abs(deepest - reference.deepest) * 1e3
+    return dict(zip(FIGURES, figures, strict=True))
+
+
+def references(trenches: Iterable[Trench]) -> dict[str, dict[Trench, Profile]]:
+    """The closed form and the exact relaxation of every trench."""
+    trenches = list(trenches)
+    runs = [Pass(math.radians(beta), sinkage * 1e-3) for beta, sinkage in trenches]
+    return {
+        "closed-form": {trench: closed_form(run) for trench, run in zip(trenches, runs, strict=True)},
+        "exact": dict(zip(trenches, relaxed(runs), strict=True)),
+    }
+
+
+def compare_with_scans(ruts: dict[Trench, Rut], scans: dict[Trench, list[Scan]]) -> list[dict[str, Any]]:
+    """A row for every trench that was scanned; the scans are laid on the simulated section first."""
+    rows = []
+    for trench, some in scans.items():
+        profile = ruts[trench].profile
+        settled = Profile(profile.x, np.where(np.abs(profile.z) > 1e-5, profile.z, 0))
+        measured = measured_profile(some, settled)
+        against = compare(measured, settled)
+        figures = {name: against[key] for name, key in zip(FIGURES, ("mean", "median", "depth"), strict=True)}
+        rows.append({**_named(trench), "reference": "measured", **figures, "scans": measured.scans})
+    return rows
+
+
+def experiment(
+    spacing: float = 2e-3,
+    rules: Iterable[str] = tuple(RULES),
+    scans: dict[Trench, list[Scan]] | None = None,
+    tell: Tell = lambda _: None,
+) -> tuple[dict[str, Any], dict[str, dict[Trench, Profile]]]:
+    """The table of all fifteen trenches, and the profiles by their source (a rule or a reference).
+
+    The table holds `rows`, and in `summary`, `by_beta_deg` and `by_sinkage_mm` their means.
+    """
+    known = references(TRENCHES)
+    profiles: dict[str, dict[Trench, Profile]] = dict(known)
+    rows: list[dict[str, Any]] = []
+    scans = scans or {}
+    for rule in rules:
+        ruts = simulate_all(dict.fromkeys([*TRENCHES, *scans]), spacing, RULES[rule], tell)
+        profiles[rule] = {trench: rut.profile for trench, rut in ruts.items()}
+        for name, of in known.items():
+            for trench, reference in of.items():
+                rut = ruts[trench]
+                figures = errors(rut.profile, rut.profile.deepest, reference)
+                cost = {"unsteady_mm": rut.unsteady * 1e3, "seconds": rut.seconds}
+                rows.append({**_named(trench), "rule": rule, "reference": name, **figures, **cost})
+        rows += [{"rule": rule, **row} for row in compare_with_scans(ruts, scans)]
+    baseline = [
+        {**_named(t), "rule": "exact", "reference": "closed-form", **errors(p, p.deepest, known["closed-form"][t])}
+        for t, p in known["exact"].items()
+    ]
+    means = partial(_means, rows + baseline)
+    report = {
+        "spacing_mm": spacing * 1e3,
+        "rows": rows,
+        "summary": means(),
+        "by_beta_deg": {f"{beta:g}": means(beta_deg=beta) for beta in ANGLES},
+        "by_sinkage_mm": {f"{sinkage:g}": means(sinkage_mm=sinkage) for sinkage in SINKAGES},
+        "paper": PAPER,
+        "not_scanned": [list(trench) for trench in TRENCHES if trench not in scans] if scans else [],
+    }
+    return report, profiles
+
+
+def _named(trench: Trench) -> dict[str, float]:
+    return {"beta_deg": trench[0], "sinkage_mm": trench[1]}
+
+
+def _means(rows: list[dict[str, Any]], **of: float) -> dict[str, dict[str, dict[str, float]]]:
+    """{rule: {reference: figures}}, averaged over the trenches."""
+    some = [row for row in rows if all(row[key] == value for key, value in of.items())]
+    table: dict[str, dict[str, dict[str, float]]] = {}
+    for rule, reference in dict.fromkeys((row["rule"], row["reference"]) for row in some):
+        alike = [row for row in some if (row["rule"], row["reference"]) == (rule, reference)]
+        means = {name: float(np.nanmean([row[name] for row in alike])) for name in FIGURES}
+        table.setdefault(rule, {})[reference] = means
+    return table

@@ -1,0 +1,130 @@
+"""A wheel's pass in one go: its cut, and the sand of the cut in a pile on each side.
+
+The closed form's step before the sand flows (trench.py), as a push: in the way's frame the wheel cuts down to the lowest its
+rim comes to, here a parabola as deep as the sinkage h and as wide as the chord 2 s, and what was above stands beside the
+cut's edges at w / 2, w = b cos(beta) + 2 s sin(beta), in right triangles at repose of the height sqrt(2 t A), t = tan(angle
+of repose) and A the area that their side gets of each section. Sections exchange nothing.
+
+Source: Pavlov & Johnson, ICRA 2019, restated in trench.py.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxsand.displace import Job, whole
+from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.scene import Scene
+from jaxsand.swath import ROOM, complete, hat, typical_drop, wedge
+from jaxsand.tool import Grousers, Pose, Wheel, local, reach
+from jaxsand.window import Whole
+
+_SAMPLES = 8  # of the cut, along each side of a cell
+_TEN = math.radians(10)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SplitPush:
+    """The cut of a wheel's leg, and its sand in two piles beside it, at once; for a `Wheel`.
+
+    First order in the spacing. It works on the whole map, whatever the scene's window. Where there is no room for a pile
+    (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. Slip angles a hair from 10 or
+    80 degrees, or from where flank and rim cut alike, are apart by a jump (see `trench.Pass`).
+    """
+
+
+def push_split(
+    scene: Scene, height: jax.Array, path: jax.Array, push: SplitPush, record: Callable[[jax.Array], Any] | None = None
+) -> tuple[Pushed, Any]:
+    """Moves the wheel along the legs of `path` [n, 2] (m); see `along_legs`."""
+    scene = replace(scene, window=Whole())
+
+    def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
+        h, lost, moved = state
+        return _pass(scene, job, pose, length, h), lost, moved
+
+    return along_legs(scene, height, path, 0.125, leg, record)
+
+
+def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -> jax.Array:
+    """One leg: cuts, and sets down beside the cut what stood there, slice by slice along the way."""
+    dx, wheel = job.bed.spacing, job.tool
+    pose, length = over_the_map(scene, job, pose, length)
+    side = jnp.where(wheel.slip_angle < 0, -1, 1)
+    s, n = local(pose, job.x, job.y)
+    n = n * side  # the flank leads on the positive side
+    taken = whole(job, _cut(job, s, n, length, h))
+    sand = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
+    mu = typical_drop(job, (taken + 1e-6) * sand) / dx
+    rim, flank, share = _shares(wheel)
+
+    # Slices along the way, of a spacing or more each; a cell belongs to two of them.
+    least, _ = corners(scene, job, pose)
+    far = reach(wheel) + dx
+    origin = jnp.maximum(-far, least)
+    count = math.ceil(math.hypot(*scene.grid.shape) / 4) + 2
+    slices = jnp.arange(count, dtype=h.dtype)
+    thick = jnp.maximum(dx, (length + far - origin) / (count - 1))
+    hats = hat(jnp.clip((s - origin) / thick, 0, count - 1).reshape(1, -1), slices)
+    cut = hats @ taken.ravel()
+    area = cut * (dx**2 / thick)
+    left = (share * cut, (1 - share) * cut)
+    grousers = wheel.grousers
+    if isinstance(grousers, Grousers):  # from what the rim pushes, or from both piles where they are alike
+        behind = grousers.spin * wheel.width * grousers.height * grousers.fill
+        behind = cut * jnp.minimum(behind / jnp.where(area > 0, area, 1), jnp.where(share == 0.5, 1, 1 - share))
+        left = (left[0] - jnp.where(share == 0.5, behind / 2, 0), left[1] - jnp.where(share == 0.5, behind / 2, behind))
+    put, kept = jnp.zeros_like(h), cut
+    for way, amount in zip((1, -1), left, strict=True):
+        height = (amount * (dx**2 / thick) / mu * 2) @ hats
+        long = jnp.maximum(jnp.sqrt(jnp.where(height > 0, height, 1)) * (height > 0), dx / 2).reshape(h.shape)
+        pile = wedge(way * n - (rim / 2 + flank), long, dx) * sand
+        room = hats @ pile.ravel() * (dx / thick)
+        placed = amount * jnp.minimum(room / ROOM, 1)
+        kept = kept - placed
+        put = put + pile * (placed / jnp.where(room > 0, room, 1) * (dx / thick) @ hats).reshape(h.shape)
+    stays = (kept / jnp.where(cut > 0, cut, 1)) @ hats
+    put = whole(job, put + taken * stays.reshape(h.shape))
+    return h - taken + complete(job, taken, put)
+
+
+def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The rim's and a flank's width of the cut (m), and the share of the sand that goes to the flank's side."""
+    slip = jnp.abs(wheel.slip_angle)
+    rim, flank = wheel.width * jnp.cos(slip), _chord(wheel) * jnp.sin(slip)
+    flanks, middle = 4 / 3 * flank * wheel.sinkage, wheel.sinkage * rim
+    alike = (slip < _TEN) | (jnp.abs(slip - math.pi / 2) < _TEN) | (flanks <= middle)
+    total = flanks + middle
+    return rim, flank, jnp.where(alike, 0.5, flanks / jnp.where(total > 0, total, 1))
+
+
+def _chord(wheel: Wheel) -> jax.Array:
+    """Half of the wheel's chord at level sand, s = sqrt(h (2 r - h)) (m)."""
+    return jnp.sqrt(wheel.sinkage * (2 * wheel.radius - wheel.sinkage))
+
+
+def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, h: jax.Array) -> jax.Array:
+    """The mean height over each cell of the sand above the lowest that the wheel's bottom comes to."""
+    wheel = job.tool
+    slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, _chord(wheel)
+    cos, sin = jnp.cos(slip), jnp.sin(slip)
+    least_cos, least_sin = jnp.maximum(cos, 1e-6), jnp.maximum(sin, 1e-6)
+
+    def sample(k: jax.Array, total: jax.Array) -> jax.Array:
+        """Past s, n the wheel comes with c = u sin + n cos across, a = u cos - n sin along it, s - length <= u <= s."""
+        offset = (jnp.stack([k // _SAMPLES, k % _SAMPLES]) + 0.5) / _SAMPLES - 0.5
+        at, off = s + offset[0] * job.bed.spacing, n + offset[1] * job.bed.spacing
+        first = jnp.maximum(at - length, (-half - off * cos) / least_sin)
+        last = jnp.minimum(at, (half - off * cos) / least_sin)
+        a = jnp.clip(off * sin / least_cos, first, last) * cos - off * sin
+        inside = (first <= last) & (jnp.abs(a) < chord)
+        bottom = job.bottom * (1 - (a / chord) ** 2)
+        return total + jnp.where(inside & (h > bottom), h - bottom, 0)
+
+    return lax.fori_loop(0, _SAMPLES**2, sample, jnp.zeros_like(h)) / _SAMPLES**2
