@@ -8,9 +8,9 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from jaxsand.commands import SCHEMES, run_benchmark, run_plan, run_settle, run_shape
+from jaxsand.commands import SCHEMES, run_benchmark, run_plan, run_settle, run_shape, run_trench
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -38,7 +38,15 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jaxsand", description="Robots that shape sand. Every command answers --help.")
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    _shape(commands)
+    _settle(commands)
+    _plan(commands)
+    _trench(commands)
+    _bench(commands)
+    return parser
 
+
+def _shape(commands: Any) -> None:
     p = commands.add_parser("shape", help="find the strokes that trench a goal, push them, show what came out")
     p.add_argument("goal", help="a letter, a .txt map of # and ., a .png (dark is dug), a .npy height map in m, or terrain")
     p.add_argument("--method", choices=["plan", "search", "strokes"], default="plan", help=_METHODS)
@@ -58,6 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_shape)
 
+
+def _settle(commands: Any) -> None:
     p = commands.add_parser("settle", help="let a height map settle to its angle of repose")
     p.add_argument("input", type=Path, metavar="IN.npy", help="height map [H, W] in m")
     p.add_argument("--out-file", type=Path, required=True, metavar="OUT.npy")
@@ -70,6 +80,8 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_settle)
 
+
+def _plan(commands: Any) -> None:
     p = commands.add_parser("plan", help="the shortest single stroke over a binary map")
     p.add_argument("map", metavar="MAP.txt", help="rows of # (dig) and ., S marks the start; or a letter")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
@@ -82,9 +94,21 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_plan)
 
+
+def _trench(commands: Any) -> None:
+    p = commands.add_parser("trench", help="a wheel's trenches, beside their closed form, their exact relaxation and scans")
+    p.add_argument("--spacing-mm", type=_number, default=2.0, metavar="D", help="grid spacing (2)")
+    p.add_argument("--rule", choices=["own", "split"], help="own: the push rule; split: piles as in the closed form (both)")
+    p.add_argument("--measured", type=Path, metavar="CSV", help="scans: beta_deg, sinkage_mm, scan, x_mm, z_mm")
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the profiles, two figures and the report")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(run=run_trench)
+
+
+def _bench(commands: Any) -> None:
     p = commands.add_parser("bench", help="error against run time, and speed beside plain numpy and plain C")
     p.add_argument(
-        "what", nargs="?", choices=["settle", "push", "plan", "sand", "all", "stability", "letters"], default="all"
+        "what", nargs="?", choices=["settle", "push", "plan", "sand", "trench", "all", "stability", "letters"], default="all"
     )
     p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
@@ -92,7 +116,6 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report and its figure")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_benchmark)
-    return parser
 
 
 _METHODS = "plan: a shortest path; search: strokes tried on real sand; strokes: a glyph's own"

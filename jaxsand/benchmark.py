@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import analysis, complexity, expansions, goals, piles, sandbench, stability, workprec
+from jaxsand import analysis, complexity, expansions, goals, piles, rutbench, sandbench, stability, workprec
 from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
@@ -45,7 +45,7 @@ _C = "C loop, one core"
 
 
 def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int = 3, seed: int = 0) -> dict[str, Any]:
-    """The figures for `what`: settle, push, plan, or all of these; sand, stability, or letters.
+    """The figures for `what`: settle, push, plan, or all of these; sand, trench, stability, or letters.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
     """
@@ -74,6 +74,9 @@ def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int 
     if what == "sand":
         report["children"] = sandbench.children_per_second()
         report["sand"] = sandbench.bench_sand(tell, seed=seed)
+    if what == "trench":
+        report["trench_by_spacing"] = rutbench.against_spacing(tell, grids + 1)
+        report["trench_settles"] = rutbench.settling(tell)
     if what == "stability":
         report["stability"] = stability.stability(tell=tell)
     if what == "letters":

@@ -34,7 +34,7 @@ SINKAGES = (5.0, 15.0, 25.0)
 TRENCHES: tuple[Trench, ...] = tuple((beta, sinkage) for sinkage in SINKAGES for beta in ANGLES)
 RULES: dict[str, Push] = {"own": SteppedPush(), "split": SplitPush()}
 FIGURES = ("mean_abs_mm", "median_abs_mm", "depth_error_mm")
-# arXiv:1908.02745, Table I: its simulator over 14 trenches, against the closed form and against LIDAR scans (mm).
+# arXiv:1908.02745: its simulator over 14 trenches, against the closed form and against LIDAR scans (mm).
 PAPER = {
     "closed-form": dict(zip(FIGURES, (1.1, 0.4, 0.6), strict=True)),
     "measured": dict(zip(FIGURES, (2.2, 1.7, 0.9), strict=True)),
@@ -60,7 +60,7 @@ class Rut:
 def simulate(trench: Trench, spacing: float, push: Push) -> Rut:
     """Tows the paper's wheel one metre over level sand on cells of `spacing` (m), and takes the section half-way.
 
-    Its way runs over the middle of a row of cells. The sand is computed in a window that follows the wheel, and settles
+    Its way runs along the middle of a row of cells. The sand is computed in a window that follows the wheel, and settles
     everywhere at the end.
     """
     shape = round(_WIDE / spacing) // 2 * 2 + 1, round((_BEFORE + _LENGTH + _AFTER) / spacing)
@@ -120,17 +120,32 @@ def references(trenches: Iterable[Trench]) -> dict[str, dict[Trench, Profile]]:
     }
 
 
-def compare_with_scans(ruts: dict[Trench, Rut], scans: dict[Trench, list[Scan]]) -> list[dict[str, Any]]:
-    """A row for every trench that was scanned; the scans are laid on the simulated section first."""
-    rows = []
+def compare_with_scans(
+    ruts: dict[Trench, Rut], scans: dict[Trench, list[Scan]]
+) -> tuple[list[dict[str, Any]], dict[Trench, Profile]]:
+    """A row for every trench that was scanned, and the measured sections, laid on the simulated ones."""
+    rows, sections = [], {}
     for trench, some in scans.items():
         profile = ruts[trench].profile
         settled = Profile(profile.x, np.where(np.abs(profile.z) > 1e-5, profile.z, 0))
         measured = measured_profile(some, settled)
         against = compare(measured, settled)
-        figures = {name: against[key] for name, key in zip(FIGURES, ("mean", "median", "depth"), strict=True)}
-        rows.append({**_named(trench), "reference": "measured", **figures, "scans": measured.scans})
-    return rows
+        figures = {name: against[key] * 1e3 for name, key in zip(FIGURES, ("mean", "median", "depth"), strict=True)}
+        shown = {"scans": measured.scans, "spikes": measured.rejected, "covered": against["covered"]}
+        rows.append({**_named(trench), "reference": "measured", **figures, **shown})
+        known = np.isfinite(measured.z)
+        sections[trench] = Profile(measured.x[known], measured.z[known])
+    return rows, sections
+
+
+def check_scans(scans: dict[Trench, list[Scan]]) -> None:
+    """Raises ValueError where the experiment cannot make a scanned trench."""
+    for beta, sinkage in scans:
+        if not (0 <= beta <= 90 and 0 < sinkage <= 30):
+            raise ValueError(
+                f"measured: got a trench of beta {beta:g} degrees, sinkage {sinkage:g} mm; give 0 to 90 degrees and "
+                "sinkages above 0 up to 30 mm"
+            )
 
 
 def experiment(
@@ -156,7 +171,9 @@ def experiment(
                 figures = errors(rut.profile, rut.profile.deepest, reference)
                 cost = {"unsteady_mm": rut.unsteady * 1e3, "seconds": rut.seconds}
                 rows.append({**_named(trench), "rule": rule, "reference": name, **figures, **cost})
-        rows += [{"rule": rule, **row} for row in compare_with_scans(ruts, scans)]
+        if scans:
+            more, profiles["measured"] = compare_with_scans(ruts, scans)
+            rows += [{"rule": rule, **row} for row in more]
     baseline = [
         {**_named(t), "rule": "exact", "reference": "closed-form", **errors(p, p.deepest, known["closed-form"][t])}
         for t, p in known["exact"].items()

@@ -25,9 +25,9 @@ FLOORS = [
     {"task", "goals", "planner", "plain", "scans"},
     {"sandplan"},
     {"shaping", "files", "rut"},
-    {"workprec", "stability", "complexity", "expansions", "sandbench"},
+    {"workprec", "stability", "complexity", "expansions", "sandbench", "rutbench"},
     {"analysis", "piles"},
-    {"render", "benchmark"},
+    {"render", "rutfigures", "benchmark"},
     {"commands"},
     {"__main__"},
 ]
@@ -41,9 +41,9 @@ INSIDE = {
         {"anytime"},
     ],
     "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],
-    "commands": [{"printing"}, {"shape", "settle", "plan", "bench"}],
+    "commands": [{"printing"}, {"shape", "settle", "plan", "trench", "bench"}],
 }
-HEAVY = {"matplotlib": {"render", "goals"}, "PIL": {"render", "goals"}}
+HEAVY = {"matplotlib": {"render", "rutfigures", "goals"}, "PIL": {"render", "goals"}}
 
 
 def imports(path):

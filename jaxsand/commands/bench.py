@@ -23,6 +23,11 @@ def run_benchmark(options: argparse.Namespace) -> None:
                 save_figure(complexity_figure(report), path)
             with written(out / "bench-plan-alpha.png") as path:
                 save_figure(alpha_figure(report), path)
+        if "trench_by_spacing" in report:
+            from jaxsand.rutfigures import spacing_figure
+
+            with written(out / "bench-trench.png") as path:
+                save_figure(spacing_figure(report["trench_by_spacing"]), path)
         with written(out / f"bench-{options.what}.json") as path:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")

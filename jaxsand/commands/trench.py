@@ -1,0 +1,74 @@
+"""`jaxsand trench`: the trenches of a wheel, beside what is known of them."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from jaxsand.commands.printing import show
+from jaxsand.files import as_json, as_table, folder, progress, written
+
+
+def run_trench(options: argparse.Namespace) -> None:
+    tell = progress()
+    if not 0.1 <= options.spacing_mm <= 20:
+        raise ValueError(f"spacing-mm: got {options.spacing_mm:g}; give millimetres from 0.1 to 20")
+    out = folder(options.out) if options.out else None
+    from jaxsand import rut
+    from jaxsand.scans import read_scans
+
+    scans = read_scans(options.measured) if options.measured else {}
+    rut.check_scans(scans)
+    rules = [options.rule] if options.rule else list(rut.RULES)
+    report, profiles = rut.experiment(options.spacing_mm * 1e-3, rules, scans, tell)
+    if out:
+        from jaxsand.render import save_figure
+        from jaxsand.rutfigures import errors_figure, profiles_figure
+
+        files = [out / name for name in ("profiles.csv", "trench.png", "trench-errors.png", "trench.json")]
+        report["files"] = [str(file) for file in files]
+        tell("drawing")
+        with written(files[0]) as path:
+            _write_profiles(profiles, path)
+        with written(files[1]) as path:
+            save_figure(profiles_figure(profiles), path)
+        with written(files[2]) as path:
+            save_figure(errors_figure(profiles), path)
+        with written(files[3]) as path:
+            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+    tell("")
+    show(options, report, _table)
+
+
+def _write_profiles(profiles: dict[str, dict[tuple[float, float], Any]], path: Path) -> None:
+    """All sections: the simulated ones at their cells, the others at their corners or points."""
+    with path.open("w", encoding="utf-8") as file:
+        file.write("beta_deg,sinkage_mm,source,x_mm,z_mm\n")
+        for source, of in profiles.items():
+            for (beta, sinkage), profile in of.items():
+                for x, z in zip(profile.x * 1e3, profile.z * 1e3, strict=True):
+                    file.write(f"{beta:g},{sinkage:g},{source},{x:.4f},{z:.4f}\n")
+
+
+def _table(report: dict[str, Any]) -> str:
+    """Every trench, then the means by angle, by sinkage and over all, then the paper's."""
+    rows = [
+        {"name": f"{row['rule']} against {row['reference']}", **{k: v for k, v in row.items() if not isinstance(v, str)}}
+        for row in report["rows"]
+    ]
+    lines = as_table(rows, f"trenches, {report['spacing_mm']:g} mm")
+    means = {
+        "over all": report["summary"],
+        **{f"at {beta} degrees": of for beta, of in report["by_beta_deg"].items()},
+        **{f"at {sinkage} mm": of for sinkage, of in report["by_sinkage_mm"].items()},
+    }
+    averages = [
+        {"name": f"{where}: {rule} against {reference}", **figures}
+        for where, of in means.items()
+        for rule, against in of.items()
+        for reference, figures in against.items()
+    ]
+    paper = [
+        {"name": f"arXiv:1908.02745 against {reference}", **report["paper"][reference]}
+        for reference in ("closed-form", "measured")
+    ]
+    return "\n".join([*lines, "", *as_table(averages + paper, "means")])

@@ -1,0 +1,89 @@
+"""What the wheel's trenches cost: their error against run time over the spacing, and the sweeps until one is still."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.rules import UntilStill
+from jaxsand.rut import FIGURES, RULES, TRENCHES, errors, references, simulate_all
+from jaxsand.scene import make_scene
+from jaxsand.schemes import Multilevel, Relaxation, Scheme, SuperTimeStepping
+from jaxsand.settling import settle
+from jaxsand.sim import act
+from jaxsand.split import SplitPush
+from jaxsand.tool import Wheel
+
+Tell = Callable[[str], None]
+SPACINGS = (4e-3, 2e-3, 1e-3, 5e-4)
+_SCHEMES: dict[str, Scheme] = {
+    "paper's sweep, k = dx^2/8": Relaxation(),
+    "relaxation 1/6.83": Relaxation(1 / 6.83),
+    "super-time-stepping": SuperTimeStepping(),
+    "super-time-stepping, growth 0.8": SuperTimeStepping(0.8),
+    "multilevel": Multilevel(),
+}
+
+
+def against_spacing(tell: Tell = lambda _: None, spacings: int = 4) -> list[dict[str, Any]]:
+    """For every rule, reference and spacing the mean figures of all trenches, and the median seconds of one (compiled, on
+    one of the cores). `finest` are the same rule's sections on the finest spacing."""
+    known = references(TRENCHES)
+    rows = []
+    for rule, push in RULES.items():
+        ruts = {spacing: simulate_all(TRENCHES, spacing, push, tell) for spacing in SPACINGS[:spacings]}
+        finest = {trench: rut.profile for trench, rut in ruts[SPACINGS[spacings - 1]].items()}
+        for name, of in {**known, "finest": finest}.items():
+            for spacing, some in ruts.items():
+                all_of_them = [errors(some[t].profile, some[t].profile.deepest, _toed(of[t])) for t in TRENCHES]
+                figures = {key: float(np.mean([row[key] for row in all_of_them])) for key in FIGURES}
+                seconds = float(np.median([some[t].seconds for t in TRENCHES[1:]]))
+                rows.append({"rule": rule, "against": name, "spacing_mm": spacing * 1e3, **figures, "seconds": seconds})
+    return rows
+
+
+def _toed(profile: Any) -> Any:
+    """A simulated section between its toes."""
+    moved = np.flatnonzero(np.abs(profile.z) > 1e-5)
+    part = slice(max(moved[0] - 1, 0), moved[-1] + 2)
+    return type(profile)(profile.x[part], profile.z[part])
+
+
+def settling(tell: Tell = lambda _: None, turns: int = 5) -> list[dict[str, Any]]:
+    """The paper's case of 160 x 160 cells: a trench before the sand flows (22.5 degrees, 15 mm, cells of 2 mm) is left to
+    settle. `error` is the largest distance from the limit of small steps over the largest change of height."""
+    spacing, cells = 2e-3, 160
+    wheel = Wheel(sinkage=0.015, slip_angle=math.radians(22.5))
+    scene = make_scene((cells, cells), spacing, tool=wheel)
+    stroke = np.array([0.06, 0.16, 0.26, 0.16])
+    start = act(scene, jnp.zeros((cells, cells), jnp.float32), stroke, push=SplitPush()).height
+    bed = make_scene((cells, cells), spacing)
+    with jax.enable_x64(True):
+        slow = settle(
+            bed,
+            jnp.asarray(np.asarray(start), jnp.float64),
+            scheme=SuperTimeStepping(0.05, 1 / 64),
+            stop=UntilStill(1e-5, bound=400_000),
+        )
+    limit = np.asarray(slow.height)
+    largest = np.abs(limit - np.asarray(start, float)).max()
+    rows = []
+    for name, scheme in _SCHEMES.items():
+        for tolerance in (0.1, 0.03, 0.01, 1e-3):
+            tell(f"settling 160 x 160, {name}, tolerance {tolerance:g}")
+            stop = UntilStill(tolerance)
+            settled = jax.block_until_ready(settle(bed, start, scheme=scheme, stop=stop))
+            best = math.inf
+            for _ in range(turns):
+                began = time.perf_counter()
+                jax.block_until_ready(settle(bed, start, scheme=scheme, stop=stop))
+                best = min(best, time.perf_counter() - began)
+            error = float(np.abs(np.asarray(settled.height, float) - limit).max() / largest)
+            rows.append(
+                {"name": name, "tolerance": tolerance, "sweeps": int(settled.sweeps), "seconds": best, "error": error}
+            )
+    return rows
