@@ -5,6 +5,8 @@ rim comes to, here a parabola as deep as the sinkage h and as wide as the chord 
 cut's edges at w / 2, w = b cos(beta) + 2 s sin(beta), in right triangles at repose of the height sqrt(2 t A), t = tan(angle
 of repose) and A the area that their side gets of each section. Sections exchange nothing.
 
+Grousers leave their part in the cut, level, and the pile that the rim pushes has less.
+
 Source: Pavlov & Johnson, ICRA 2019, restated in trench.py.
 """
 
@@ -59,10 +61,10 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
     side = jnp.where(wheel.slip_angle < 0, -1, 1)
     s, n = local(pose, job.x, job.y)
     n = n * side  # the flank leads on the positive side
-    taken = whole(job, _cut(job, s, n, length, h))
+    rim, flank, share, floor = _shares(wheel)
+    taken = whole(job, _cut(job, s, n, length, floor, h))
     sand = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
     mu = typical_drop(job, (taken + 1e-6) * sand) / dx
-    rim, flank, share = _shares(wheel)
 
     # Slices along the way, of a spacing or more each; a cell belongs to two of them.
     least, _ = corners(scene, job, pose)
@@ -73,15 +75,8 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
     thick = jnp.maximum(dx, (length + far - origin) / (count - 1))
     hats = hat(jnp.clip((s - origin) / thick, 0, count - 1).reshape(1, -1), slices)
     cut = hats @ taken.ravel()
-    area = cut * (dx**2 / thick)
-    left = (share * cut, (1 - share) * cut)
-    grousers = wheel.grousers
-    if isinstance(grousers, Grousers):  # from what the rim pushes, or from both piles where they are alike
-        behind = grousers.spin * wheel.width * grousers.height * grousers.fill
-        behind = cut * jnp.minimum(behind / jnp.where(area > 0, area, 1), jnp.where(share == 0.5, 1, 1 - share))
-        left = (left[0] - jnp.where(share == 0.5, behind / 2, 0), left[1] - jnp.where(share == 0.5, behind / 2, behind))
     put, kept = jnp.zeros_like(h), cut
-    for way, amount in zip((1, -1), left, strict=True):
+    for way, amount in ((1, share * cut), (-1, (1 - share) * cut)):
         height = (amount * (dx**2 / thick) / mu * 2) @ hats
         long = jnp.maximum(jnp.sqrt(jnp.where(height > 0, height, 1)) * (height > 0), dx / 2).reshape(h.shape)
         pile = wedge(way * n - (rim / 2 + flank), long, dx) * sand
@@ -94,14 +89,34 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
     return h - taken + complete(job, taken, put)
 
 
-def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The rim's and a flank's width of the cut (m), and the share of the sand that goes to the flank's side."""
+def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The rim's and a flank's width of the cut (m), the share of its sand that goes to the flank's side, its floor's height
+    (m)."""
     slip = jnp.abs(wheel.slip_angle)
     rim, flank = wheel.width * jnp.cos(slip), _chord(wheel) * jnp.sin(slip)
     flanks, middle = 4 / 3 * flank * wheel.sinkage, wheel.sinkage * rim
     alike = (slip < _TEN) | (jnp.abs(slip - math.pi / 2) < _TEN) | (flanks <= middle)
+    if isinstance(wheel.grousers, Grousers):
+        asked = wheel.grousers.spin * wheel.width * wheel.grousers.height * wheel.grousers.fill
+        behind = jnp.minimum(asked, jnp.where(alike, flanks + middle, middle))
+        floor = -_floor(jnp.asarray(wheel.sinkage), middle, flanks, behind)
+        middle = middle - behind
+    else:
+        floor = -jnp.asarray(wheel.sinkage)
     total = flanks + middle
-    return rim, flank, jnp.where(alike, 0.5, flanks / jnp.where(total > 0, total, 1))
+    return rim, flank, jnp.where(alike, 0.5, flanks / jnp.where(total > 0, total, 1)), floor
+
+
+def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax.Array) -> jax.Array:
+    """The depth (m) of the cut once the area `behind` lies level in it: sinkage (1 - x^2) where middle x^2 + flanks x^3 is
+    that area, by Newton's steps from x = 1, the last of which carries the derivative."""
+
+    def newton(_: Any, x: jax.Array) -> jax.Array:
+        steep = 2 * middle * x + 3 * flanks * x * x
+        return x - (middle * x * x + flanks * x**3 - behind) / jnp.where(steep > 0, steep, 1)
+
+    x = newton(0, lax.stop_gradient(lax.fori_loop(0, 30, newton, jnp.ones_like(sinkage))))
+    return sinkage * (1 - jnp.where(behind > 0, x, 0) ** 2)
 
 
 def _chord(wheel: Wheel) -> jax.Array:
@@ -109,8 +124,8 @@ def _chord(wheel: Wheel) -> jax.Array:
     return jnp.sqrt(wheel.sinkage * (2 * wheel.radius - wheel.sinkage))
 
 
-def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, h: jax.Array) -> jax.Array:
-    """The mean height over each cell of the sand above the lowest that the wheel's bottom comes to."""
+def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Array, h: jax.Array) -> jax.Array:
+    """The mean height over each cell of the sand above the lowest that the wheel's bottom comes to, and above the floor."""
     wheel = job.tool
     slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, _chord(wheel)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
@@ -124,7 +139,7 @@ def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, h: jax.Array) 
         last = jnp.minimum(at, (half - off * cos) / least_sin)
         a = jnp.clip(off * sin / least_cos, first, last) * cos - off * sin
         inside = (first <= last) & (jnp.abs(a) < chord)
-        bottom = job.bottom * (1 - (a / chord) ** 2)
+        bottom = jnp.maximum(job.bottom * (1 - (a / chord) ** 2), floor)
         return total + jnp.where(inside & (h > bottom), h - bottom, 0)
 
     return lax.fori_loop(0, _SAMPLES**2, sample, jnp.zeros_like(h)) / _SAMPLES**2

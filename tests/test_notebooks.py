@@ -76,7 +76,25 @@ def planning(names):
     assert names["sand"].lower_bound <= names["sand"].after < 0.8 * names["sand"].before
 
 
-CHECKS = {"settling": settling, "planning": planning}
+def wheel(names):
+    """Checks what notebooks/wheel.ipynb says."""
+    assert int(names["towed"].outcome) == 0
+    errors = names["errors"]
+    assert errors["split", "exact"][0] < 0.15  # cells of 5 mm
+    assert errors["own", "exact"][0] < 2
+    assert errors["exact", "closed-form"][0] > 1
+    assert 40 < np.degrees(names["angles"][names["jump"]]) < 60
+    by_rule = {rule: [r["error"] for r in names["runs"] if r["rule"] == rule] for rule in ("own", "split")}
+    assert by_rule["split"][-1] < by_rule["split"][0]
+    assert max(by_rule["split"]) < min(by_rule["own"])
+    simulated, closed = np.array(names["rows"])[:, 1:].T
+    assert np.all(np.diff(simulated) < 0)
+    assert np.all(np.diff(closed) < 0)
+    assert float(names["map_"].min()) < float(names["ground"].min()) + 0.02
+    assert all(np.diff(values)[0] > 0 for values in names["pull"].values())
+
+
+CHECKS = {"settling": settling, "planning": planning, "wheel": wheel}
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")  # plt.show() where there is a display
