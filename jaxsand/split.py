@@ -36,8 +36,8 @@ class SplitPush:
     """The cut of a wheel's leg, and its sand in two piles beside it, at once; for a `Wheel`.
 
     First order in the spacing. It works on the whole map, whatever the scene's window. Where there is no room for a pile
-    (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. Slip angles a hair from 10 or
-    80 degrees, or from where flank and rim cut alike, are apart by a jump (see `trench.Pass`).
+    (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. The piles jump with the
+    slip angle at 80 degrees (and at 10, if the flanks cut more than the rim there).
     """
 
 

@@ -7,8 +7,9 @@ width p at depth h between two flanks (w - p) / 2 wide, parabolas of area A = (w
 
 Before the sand flows, what was in the cut stands beside it in two right triangles, steep against the cut: alike, or, when
 the wheel's flank takes more than its rim (2 A > h p) and beta is 10 degrees and more from 0 and from 90, 2 A on the left and
-h p on the right. There the profile jumps with beta. After it has flowed, all faces lie at repose, the outer toes stay where
-they were, and the sand of the left and of the right pile part where the rim's cut ends.
+h p on the right. After it has flowed, all faces lie at repose, the outer toes stay where they were, and from 10 degrees on
+the sand of the left and of the right pile part where the rim's cut ends. So the profile jumps with beta at 10 degrees, where
+it is pointed, and at 80.
 
 Heights and places are in metres, x to the right across the way, 0 at the middle of the cut; angles are in radians.
 """
