@@ -34,8 +34,9 @@ class SplitPush:
     """The cut of a wheel's leg, and its sand in two piles beside it, at once; for a `Wheel`.
 
     First order in the spacing. It works on the whole map, whatever the scene's window. Where there is no room for a pile
-    (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. Slip angles a hair from 10 or
-    80 degrees, or from where flank and rim cut alike, are apart by a jump (see `trench.Pass`).
+    (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. What grousers carry stays in
+    the cut as well, in proportion to what was there; trench.py lays it level. Slip angles on either side of 80 degrees, or
+    of 10 where the flank then cuts more than the rim, are apart by a jump (see trench.py).
     """
 
 
@@ -64,14 +65,15 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
     mu = typical_drop(job, (taken + 1e-6) * sand) / dx
     rim, flank, share = _shares(wheel)
 
-    # Slices along the way, of a spacing or more each; a cell belongs to two of them.
-    least, _ = corners(scene, job, pose)
+    # Slices along the way, of a spacing or more each; a cell belongs to two of them, or to one at the map's edge, where
+    # slices are as long as others.
+    least, most = corners(scene, job, pose)
     far = reach(wheel) + dx
-    origin = jnp.maximum(-far, least)
+    first, last = jnp.maximum(-far, least), jnp.minimum(length + far, most)
     count = math.ceil(math.hypot(*scene.grid.shape) / 4) + 2
     slices = jnp.arange(count, dtype=h.dtype)
-    thick = jnp.maximum(dx, (length + far - origin) / (count - 1))
-    hats = hat(jnp.clip((s - origin) / thick, 0, count - 1).reshape(1, -1), slices)
+    thick = jnp.maximum(dx, (last - first) / count)
+    hats = hat(jnp.clip((s - first) / thick - 0.5, 0, count - 1).reshape(1, -1), slices)
     cut = hats @ taken.ravel()
     area = cut * (dx**2 / thick)
     left = (share * cut, (1 - share) * cut)
