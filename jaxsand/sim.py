@@ -28,7 +28,7 @@ _PUSHES: dict[tuple[type, type], Any] = {
     (Wheel, SplitPush): push_split,
     (NoTool, SteppedPush): push_along,
     (NoTool, SwathPush): push_along,
-    (NoTool, SplitPush): push_along,
+    (NoTool, SplitPush): push_split,
 }
 
 

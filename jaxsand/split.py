@@ -66,14 +66,15 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
     sand = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
     mu = typical_drop(job, (taken + 1e-6) * sand) / dx
 
-    # Slices along the way, of a spacing or more each; a cell belongs to two of them.
-    least, _ = corners(scene, job, pose)
+    # Slices along the way, of a spacing or more each; a cell belongs to two of them, or to one at the map's edge, where
+    # slices are as long as others.
+    least, most = corners(scene, job, pose)
     far = reach(wheel) + dx
-    origin = jnp.maximum(-far, least)
+    first, last = jnp.maximum(-far, least), jnp.minimum(length + far, most)
     count = math.ceil(math.hypot(*scene.grid.shape) / 4) + 2
     slices = jnp.arange(count, dtype=h.dtype)
-    thick = jnp.maximum(dx, (length + far - origin) / (count - 1))
-    hats = hat(jnp.clip((s - origin) / thick, 0, count - 1).reshape(1, -1), slices)
+    thick = jnp.maximum(dx, (last - first) / count)
+    hats = hat(jnp.clip((s - first) / thick - 0.5, 0, count - 1).reshape(1, -1), slices)
     cut = hats @ taken.ravel()
     put, kept = jnp.zeros_like(h), cut
     for way, amount in ((1, share * cut), (-1, (1 - share) * cut)):

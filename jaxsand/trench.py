@@ -7,14 +7,15 @@ width p at depth h between two flanks (w - p) / 2 wide, parabolas of area A = (w
 
 Before the sand flows, what was in the cut stands beside it in two right triangles, steep against the cut: alike, or, when
 the wheel's flank takes more than its rim (2 A > h p) and beta is 10 degrees and more from 0 and from 90, 2 A on the left and
-h p on the right. After it has flowed, all faces lie at repose, the outer toes stay where they were, and from 10 degrees on
-the sand of the left and of the right pile part where the rim's cut ends. So the profile jumps with beta at 10 degrees, where
-it is pointed, and at 80.
+h p on the right. The piles jump with beta where the 10 degrees decide, not at 2 A = h p, where the two rules agree. After
+the sand has flowed, all faces lie at repose, the outer toes stay where they were, and the sand of the left and of the right
+pile part where the rim's cut ends; below 10 degrees in the middle, so that pointed profiles jump there.
 
 Heights and places are in metres, x to the right across the way, 0 at the middle of the cut; angles are in radians.
 """
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,7 +58,7 @@ class Pass:
         _within("repose_angle", self.repose_angle, 0, math.pi / 2 * (1 - 1e-9), "rad between 0 and pi/2")
         _within("sinkage", self.sinkage, 0, self.radius, "metres from 0 to the wheel's radius")
         for name in ("spin", "grouser_height", "grouser_fill"):
-            _within(name, getattr(self, name), 0, math.inf, "a number of 0 or more")
+            _within(name, getattr(self, name), 0, sys.float_info.max, "a finite number of 0 or more")
 
     @property
     def slope(self) -> float:
@@ -159,7 +160,8 @@ def closed_form(run: Pass) -> Profile:
     drawn up for a cut filled level to the depth of `Pass.floor`.
 
     Raises:
-      ValueError: where the closed form breaks down: a pile would end below the level sand.
+      ValueError: where the closed form breaks down: a pile would end below the level sand, or a floor be narrower than
+        nothing (where pointed and flat profiles meet; of the source's wheel and sand 2% of all slip angles and sinkages).
     """
     t, w, p = run.slope, run.swept, run.rim
     left, right = (math.sqrt(2 * t * area) for area in run.piles())
@@ -176,7 +178,7 @@ def closed_form(run: Pass) -> Profile:
     if min(peaks) < -1e-12 or feet[1] - feet[0] < -1e-9:
         raise ValueError(
             f"slip_angle: got {math.degrees(run.slip_angle):.4g} degrees at a sinkage of {run.sinkage * 1e3:.4g} mm, where "
-            "the closed form has no profile (one side's sand does not reach the soil-division line); use relaxed instead"
+            "the closed form has no profile (its faces would cross, or a pile end below the level sand); use relaxed instead"
         )
     x = [toes[0], toes[0] + peaks[0] / t, feet[0], max(feet), toes[1] - peaks[1] / t, toes[1]]
     return Profile(np.array(x), np.array([0.0, peaks[0], -depth, -depth, peaks[1], 0.0]))
@@ -224,6 +226,9 @@ def relaxed(runs: list[Pass], spacing: float = 5e-4) -> list[Profile]:
 
     Computed in float64 on cells of `spacing` (m), which is where the error is: about mu spacing / 2 at a corner.
     """
+    if len({run.repose_angle for run in runs}) != 1:
+        angles = sorted({run.repose_angle for run in runs})
+        raise ValueError(f"runs: got repose angles {angles}; give at least one run, all of one angle")
     sections = [unsettled(run) for run in runs]
     reach = max(abs(end) for section in sections for end in section.toes) * 1.1 + 10 * spacing
     half = math.ceil(reach / spacing)
