@@ -40,6 +40,8 @@ def against_spacing(tell: Tell = lambda _: None, spacings: int = 4) -> list[dict
         finest = {trench: rut.profile for trench, rut in ruts[SPACINGS[spacings - 1]].items()}
         for name, of in {**known, "finest": finest}.items():
             for spacing, some in ruts.items():
+                if of is finest and spacing == SPACINGS[spacings - 1]:
+                    continue
                 all_of_them = [errors(some[t].profile, some[t].profile.deepest, _toed(of[t])) for t in _SOME]
                 figures = {key: float(np.mean([row[key] for row in all_of_them])) for key in FIGURES}
                 seconds = float(np.median([some[t].seconds for t in _SOME[1:]]))

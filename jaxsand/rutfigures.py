@@ -85,6 +85,7 @@ def spacing_figure(rows: list[dict[str, Any]]) -> "Figure":
             ax.plot([r["seconds"] for r in some], [r[figure_of] for r in some], "osD^vP"[k % 6] + "-", ms=4, label=label)
             for row in some if not k else []:
                 ax.annotate(f"{row['spacing_mm']:g} mm", (row["seconds"], row[figure_of]), fontsize=7)
+        ax.margins(x=0.15)
         ax.set(xscale="log", yscale="log", xlabel="run time of one trench (s)")
         ax.set_title({"mean_abs_mm": "mean error (mm)", "depth_error_mm": "depth error (mm)"}[figure_of], loc="left")
     axes[0].legend(frameon=False, fontsize=8)
