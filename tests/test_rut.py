@@ -82,7 +82,6 @@ def test_the_window_that_follows_the_wheel_changes_nothing_that_matters(monkeypa
     monkeypatch.setattr(rut, "_AROUND", 10.0)
     whole = rut.simulate((45.0, 15.0), 4e-3, SteppedPush())
     assert np.abs(near.profile.z - whole.profile.z).max() < 1e-5
-    assert near.outcome == whole.outcome == 0
 
 
 def test_errors_are_exact_for_known_differences():
