@@ -62,15 +62,15 @@ def _shape(commands: Any) -> None:
     p.add_argument("--spacing", type=_number, help="grid spacing in m (0.01)")
     p.add_argument("--resolution", type=_count, help="grid cells to a map cell (6)")
     p.add_argument("--cells", type=_count, help="grid cells along the longer side of a .png or terrain (48)")
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (shape-GOAL)")
+    p.add_argument("--out", type=_path, metavar="DIR", help="folder to write to (shape-GOAL)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_shape)
 
 
 def _settle(commands: Any) -> None:
     p = commands.add_parser("settle", help="let a height map settle to its angle of repose")
-    p.add_argument("input", type=Path, metavar="IN.npy", help="height map [H, W] in m")
-    p.add_argument("--out-file", type=Path, required=True, metavar="OUT.npy")
+    p.add_argument("input", type=_path, metavar="IN.npy", help="height map [H, W] in m")
+    p.add_argument("--out-file", type=_path, required=True, metavar="OUT.npy")
     p.add_argument("--spacing", type=_number, default=0.01, metavar="M", help="grid spacing in m (0.01)")
     p.add_argument("--repose-deg", type=_number, default=29.0, help="angle of repose (29)")
     p.add_argument("--neighbours", type=_neighbours, choices=[4, 8, "isotropic"], default=8, help="4, 8 or isotropic (8)")
@@ -90,7 +90,7 @@ def _plan(commands: Any) -> None:
     p.add_argument("--engine", choices=["auto", "paper", "astar", "exact", "anytime", "frontier"], default="auto")
     p.add_argument("--weight", type=_number, metavar="W", help="how much astar and paper overrate what is left (1)")
     p.add_argument("--seconds", type=_number, metavar="S", help="time for anytime (10); with auto, use anytime")
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder for a picture of the path, and the report")
+    p.add_argument("--out", type=_path, metavar="DIR", help="folder for a picture of the path, and the report")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_plan)
 
@@ -99,8 +99,9 @@ def _trench(commands: Any) -> None:
     p = commands.add_parser("trench", help="a wheel's trenches, beside their closed form, their exact relaxation and scans")
     p.add_argument("--spacing-mm", type=_number, default=2.0, metavar="D", help="grid spacing (2)")
     p.add_argument("--rule", choices=["own", "split"], help="own: the push rule; split: piles as in the closed form (both)")
-    p.add_argument("--measured", type=Path, metavar="CSV", help="scans: beta_deg, sinkage_mm, scan, x_mm, z_mm")
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the profiles, two figures and the report")
+    columns = "beta_deg, sinkage_mm, scan, x_mm (to the right of the way; the flank that leads is on its left), z_mm"
+    p.add_argument("--measured", type=_path, metavar="CSV", help=f"scans: {columns}")
+    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the profiles, two figures and the report")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_trench)
 
@@ -113,7 +114,7 @@ def _bench(commands: Any) -> None:
     p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
     p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of the searches on sand (0)")
-    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the JSON report and its figure")
+    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the JSON report and its figure")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_benchmark)
 
@@ -137,6 +138,12 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"got {text!r}, which is no number") from None
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("got an empty name")
+    return Path(text)
 
 
 def _neighbours(text: str) -> int | str:

@@ -16,6 +16,7 @@ from jaxsand.rules import Outcome
 from jaxsand.scene import Scene
 from jaxsand.sweep import Flow
 from jaxsand.tool import NoTool, Pose, extent, local, lowest, reach
+from jaxsand.tool import usable as makes_sense
 from jaxsand.window import Window
 
 
@@ -51,9 +52,7 @@ def along_legs(
     """
     # Beyond this the floats cannot tell on which side of the map a point lies.
     farthest = scene.grid.spacing * 2.0 ** (jnp.finfo(path.dtype).nmant + 8)
-    usable = jnp.all(jnp.abs(path) < farthest)
-    for leaf in jax.tree.leaves(scene.tool):
-        usable = usable & jnp.all(jnp.isfinite(leaf))
+    usable = jnp.all(jnp.abs(path) < farthest) & makes_sense(scene.tool)
     path = jnp.where(usable, path, 0)
     if isinstance(scene.tool, NoTool):
         still = Pose(path[-1, 0], path[-1, 1], jnp.ones_like(path[0, 0]), jnp.zeros_like(path[0, 0]))
@@ -62,7 +61,7 @@ def along_legs(
         return Pushed(height, _outcome(jnp.zeros((), bool), ~usable), jnp.zeros_like(path[0, 0]), still), frames
     bed = prepare(scene)
     intact, broken = mark(scene, height)
-    # Of a path or a tool that is not finite nothing is used; the blade hangs above everything.
+    # Of a path or a tool that is not usable nothing is used; the blade hangs above everything.
     tool = jax.tree.map(lambda leaf: jnp.where(usable, leaf, bed.spacing), scene.tool)
     bottom = jnp.where(usable, lowest(scene.tool), jnp.inf)
     scale = 4 * (largest(intact) + jnp.where(usable, extent(scene.tool), 0))

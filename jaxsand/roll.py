@@ -3,7 +3,12 @@
 A wheel is a rim over each cell, at a height of its own (tool.py), with room below where it hangs above the sand. What comes
 to lie above the rim as the wheel moves leaves it ahead: off the rim, or off the flank that leads, along that face's normal,
 turned towards the wheel's way by the angle of repose at most, which is the friction of a rough face. Sand under the wheel is
-handed on until there is room. Grousers take some of what the rim displaces to behind the wheel.
+handed on by up to four cells in a sub-step, until there is room; what is on its way, one or two percent of all that is
+displaced, waits under the wheel. Grousers take some of what the rim displaces to behind the wheel.
+
+Derivatives by the height, the sinkage and, at oblique angles, the width are of use; those by the stroke's place and the slip
+angle, and by the width of a wheel that runs along its plane, are those of a map that is rough on the scale of a cell's share
+along its flanks: take finite differences over a cell, or `SplitPush`.
 
 Source: arXiv:1908.02745, "Tool Interaction", where sand leaves in the direction of travel; at slip angles below the angle of
 repose and above its complement the two agree.
@@ -20,13 +25,14 @@ import jax.numpy as jnp
 
 from jaxsand.bed import Lost
 from jaxsand.displace import Hanging, Job, Shares, contact, outwards, pass_on, settle_around, shares, spread, whole
+from jaxsand.flux import NARROW
 from jaxsand.legs import Pushed, State, along_legs, over_the_map
 from jaxsand.loop import repeat_until
 from jaxsand.push import SteppedPush, arrived, in_window
 from jaxsand.scene import Scene
 from jaxsand.swath import complete
 from jaxsand.sweep import Flow
-from jaxsand.tool import Grousers, Pose, interval, rim, wheel_frame
+from jaxsand.tool import Grousers, Pose, half_chord, interval, local, rim, wheel_frame
 
 _PASSES = 4  # how many cells sand under the wheel moves on in a sub-step
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it
@@ -96,9 +102,8 @@ def _take(job: Job, h: jax.Array, old: Hanging, new: Hanging) -> tuple[jax.Array
     """
     above = jnp.where(h > old.bottom, h - old.bottom, 0)
     below = jnp.where(h > new.bottom, jnp.maximum(jnp.minimum(h, old.bottom) - new.bottom, 0), 0)
-    grown = jnp.maximum(new.cover - old.cover, 0)
-    part = grown / jnp.where(grown > 0, 1 - old.cover, 1)
-    inside = jnp.clip(20 * old.cover - 19, 0, 1)
+    part = jnp.maximum(new.cover - old.cover, 0) / jnp.maximum(1 - old.cover, NARROW)
+    inside = jnp.clip(1 - (1 - new.cover) / NARROW, 0, 1)
     taken = whole(job, new.cover * below + jnp.maximum(part, inside) * above)
     return h - taken, taken
 
@@ -113,14 +118,15 @@ def _settle(job: Job, sweeps: int, wheel: Hanging, part: jax.Array, h: jax.Array
 
 
 def _leaving(job: Job, pose: Pose) -> Shares:
-    """The shares for the directions in which sand leaves the rim and, within a spacing of it, the leading flank."""
+    """The shares for the directions in which sand leaves the rim and, within two spacings of it, the leading flank."""
     slip, side = job.tool.slip_angle, jnp.sign(job.tool.slip_angle)
     friction = jnp.arctan(job.bed.drop / job.bed.spacing)
-    off_rim = -side * jnp.maximum(jnp.abs(slip) - friction, 0)
-    off_flank = side * jnp.maximum(math.pi / 2 - jnp.abs(slip) - friction, 0) * jnp.minimum(jnp.abs(slip) / friction, 1)
+    rest = math.pi / 2 - jnp.abs(slip)  # a face that hardly leads hardly turns sand
+    off_rim = -side * jnp.maximum(jnp.abs(slip) - friction, 0) * jnp.clip(rest / friction, 0, 1)
+    off_flank = side * jnp.maximum(rest - friction, 0) * jnp.minimum(jnp.abs(slip) / friction, 1)
     _, c = wheel_frame(job.tool, pose, job.x, job.y)
-    leads = c * side > job.tool.width / 2 - job.bed.spacing
-    turn = jnp.where(leads, off_flank, off_rim)
+    leads = jnp.clip((c * side - job.tool.width / 2) / job.bed.spacing + 2.5, 0, 1)
+    turn = off_rim + leads * (off_flank - off_rim)
     p = pose.cos * jnp.cos(turn) - pose.sin * jnp.sin(turn)
     q = pose.sin * jnp.cos(turn) + pose.cos * jnp.sin(turn)
     straight = jnp.maximum(jnp.abs(p), jnp.abs(q))
@@ -128,16 +134,17 @@ def _leaving(job: Job, pose: Pose) -> Shares:
 
 
 def _carry_back(job: Job, pose: Pose, ahead: jax.Array, h: jax.Array, carried: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Grousers leave a part of what is displaced behind the wheel, over a quarter of its chord's length."""
+    """Grousers leave a part of what is displaced in the cut behind the wheel, over a quarter of its chord's length."""
     grousers = job.tool.grousers
     if not isinstance(grousers, Grousers):
         return h, carried
     dx, wheel = job.bed.spacing, job.tool
     asked = grousers.spin * wheel.width * grousers.height * grousers.fill * ahead / dx**2
-    chord = jnp.sqrt(wheel.sinkage * (2 * wheel.radius - wheel.sinkage))
-    a, c = wheel_frame(wheel, pose, job.x, job.y)
-    side = jnp.asarray(wheel.width) / 2
-    behind = interval(a, -chord - jnp.maximum(chord / 2, dx), -chord, dx) * interval(c, -side, side, dx)
+    chord, slip = half_chord(wheel), jnp.abs(wheel.slip_angle)
+    s, n = local(pose, job.x, job.y)
+    end = -chord * jnp.cos(slip) - wheel.width / 2 * jnp.sin(slip)
+    side = (wheel.width * jnp.cos(slip) + chord * jnp.sin(slip)) / 2
+    behind = interval(s, end - jnp.maximum(chord / 2, dx), end, dx) * interval(n, -side, side, dx)
     behind = jnp.where(jnp.isnan(h), 0, behind)
     room, total = jnp.sum(behind), jnp.sum(carried)
     part = jnp.where(room > 0, jnp.minimum(asked / jnp.where(total > 0, total, 1), 1), 0)
@@ -150,7 +157,7 @@ def _radial(job: Job, pose: Pose) -> Shares:
     """The shares for directions away from the wheel's centre, in the proportions of its chord and width."""
     wheel = job.tool
     a, c = wheel_frame(wheel, pose, job.x, job.y)
-    along, across = a / (wheel.sinkage * (2 * wheel.radius - wheel.sinkage)), 4 * c / wheel.width**2
+    along, across = a / half_chord(wheel) ** 2, 4 * c / wheel.width**2
     cos = pose.cos * jnp.cos(wheel.slip_angle) + pose.sin * jnp.sin(wheel.slip_angle)
     sin = pose.sin * jnp.cos(wheel.slip_angle) - pose.cos * jnp.sin(wheel.slip_angle)
     return outwards(job, pose, along * cos - across * sin, along * sin + across * cos)

@@ -133,10 +133,10 @@ def compare_with_scans(
 def check_scans(scans: dict[Trench, list[Scan]]) -> None:
     """Raises ValueError where the experiment cannot make a scanned trench."""
     for beta, sinkage in scans:
-        if not (0 <= beta <= 90 and 0 < sinkage <= 30):
+        if not (0 <= beta <= 90 and 1 <= sinkage <= 30):
             raise ValueError(
                 f"measured: got a trench of beta {beta:g} degrees, sinkage {sinkage:g} mm; give 0 to 90 degrees and "
-                "sinkages above 0 up to 30 mm"
+                "sinkages of 1 to 30 mm"
             )
 
 
@@ -148,7 +148,8 @@ def experiment(
 ) -> tuple[dict[str, Any], dict[str, dict[Trench, Profile]]]:
     """The table of all fifteen trenches, and the profiles by their source (a rule or a reference).
 
-    The table holds `rows`, and in `summary`, `by_beta_deg` and `by_sinkage_mm` their means.
+    Scans are laid on the sections of each rule: `measured` on those of the first, `measured-split` on those of a second. The
+    table holds `rows`, and in `summary`, `by_beta_deg` and `by_sinkage_mm` their means.
     """
     known = references(TRENCHES)
     profiles: dict[str, dict[Trench, Profile]] = dict(known)
@@ -164,7 +165,8 @@ def experiment(
                 cost = {"unsteady_mm": rut.unsteady * 1e3, "seconds": rut.seconds}
                 rows.append({**_named(trench), "rule": rule, "reference": name, **figures, **cost})
         if scans:
-            more, profiles["measured"] = compare_with_scans(ruts, scans)
+            more, laid = compare_with_scans(ruts, scans)
+            profiles["measured" if "measured" not in profiles else f"measured-{rule}"] = laid
             rows += [{"rule": rule, **row} for row in more]
     baseline = [
         {**_named(t), "rule": "exact", "reference": "closed-form", **errors(p, p.deepest, known["closed-form"][t])}
@@ -193,6 +195,7 @@ def _means(rows: list[dict[str, Any]], **of: float) -> dict[str, dict[str, dict[
     table: dict[str, dict[str, dict[str, float]]] = {}
     for rule, reference in dict.fromkeys((row["rule"], row["reference"]) for row in some):
         alike = [row for row in some if (row["rule"], row["reference"]) == (rule, reference)]
-        means = {name: float(np.nanmean([row[name] for row in alike])) for name in FIGURES}
+        known = {name: [row[name] for row in alike if math.isfinite(row[name])] for name in FIGURES}
+        means = {name: float(np.mean(values)) if values else math.nan for name, values in known.items()}
         table.setdefault(rule, {})[reference] = means
     return table

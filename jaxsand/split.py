@@ -23,7 +23,7 @@ from jaxsand.displace import Job, whole
 from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
 from jaxsand.scene import Scene
 from jaxsand.swath import ROOM, complete, hat, typical_drop, wedge
-from jaxsand.tool import Grousers, Pose, Wheel, local, reach
+from jaxsand.tool import Grousers, Pose, Wheel, half_chord, local, reach
 from jaxsand.window import Whole
 
 _SAMPLES = 8  # of the cut, along each side of a cell
@@ -37,7 +37,8 @@ class SplitPush:
 
     First order in the spacing. It works on the whole map, whatever the scene's window. Where there is no room for a pile
     (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. The piles jump with the
-    slip angle at 80 degrees (and at 10, if the flanks cut more than the rim there).
+    slip angle at 80 degrees (and at 10, if the flanks cut more than the rim there). Else continuous and piecewise smooth in
+    the stroke, the wheel and the sand.
     """
 
 
@@ -94,7 +95,7 @@ def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """The rim's and a flank's width of the cut (m), the share of its sand that goes to the flank's side, its floor's height
     (m)."""
     slip = jnp.abs(wheel.slip_angle)
-    rim, flank = wheel.width * jnp.cos(slip), _chord(wheel) * jnp.sin(slip)
+    rim, flank = wheel.width * jnp.cos(slip), half_chord(wheel) * jnp.sin(slip)
     flanks, middle = 4 / 3 * flank * wheel.sinkage, wheel.sinkage * rim
     alike = (slip < _TEN) | (jnp.abs(slip - math.pi / 2) < _TEN) | (flanks <= middle)
     if isinstance(wheel.grousers, Grousers):
@@ -120,27 +121,24 @@ def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax
     return sinkage * (1 - jnp.where(behind > 0, x, 0) ** 2)
 
 
-def _chord(wheel: Wheel) -> jax.Array:
-    """Half of the wheel's chord at level sand, s = sqrt(h (2 r - h)) (m)."""
-    return jnp.sqrt(wheel.sinkage * (2 * wheel.radius - wheel.sinkage))
-
-
 def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Array, h: jax.Array) -> jax.Array:
     """The mean height over each cell of the sand above the lowest that the wheel's bottom comes to, and above the floor."""
     wheel = job.tool
-    slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, _chord(wheel)
+    slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, half_chord(wheel)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
     least_cos, least_sin = jnp.maximum(cos, 1e-6), jnp.maximum(sin, 1e-6)
+    slack = job.bed.spacing / (2 * _SAMPLES) * jnp.maximum(1 - 10 * sin, 0) / least_sin  # for samples at an upright flank
 
     def sample(k: jax.Array, total: jax.Array) -> jax.Array:
         """Past s, n the wheel comes with c = u sin + n cos across, a = u cos - n sin along it, s - length <= u <= s."""
         offset = (jnp.stack([k // _SAMPLES, k % _SAMPLES]) + 0.5) / _SAMPLES - 0.5
         at, off = s + offset[0] * job.bed.spacing, n + offset[1] * job.bed.spacing
-        first = jnp.maximum(at - length, (-half - off * cos) / least_sin)
-        last = jnp.minimum(at, (half - off * cos) / least_sin)
+        near, far = (-half - off * cos) / least_sin, (half - off * cos) / least_sin
+        first, last = jnp.maximum(at - length, near - slack), jnp.minimum(at, far + slack)
         a = jnp.clip(off * sin / least_cos, first, last) * cos - off * sin
-        inside = (first <= last) & (jnp.abs(a) < chord)
+        inside = jnp.minimum(at - near, far - (at - length)) * least_sin  # how far, across the wheel; a sample has a width
+        share = jnp.clip(0.5 + inside * (_SAMPLES / job.bed.spacing), 0, 1)
         bottom = jnp.maximum(job.bottom * (1 - (a / chord) ** 2), floor)
-        return total + jnp.where(inside & (h > bottom), h - bottom, 0)
+        return total + share * jnp.where((jnp.abs(a) < chord) & (h > bottom), h - bottom, 0)
 
     return lax.fori_loop(0, _SAMPLES**2, sample, jnp.zeros_like(h)) / _SAMPLES**2

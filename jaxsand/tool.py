@@ -1,5 +1,6 @@
 """Tools: their geometry, and how much of each cell they cover."""
 
+import math
 from dataclasses import dataclass, field
 
 import jax
@@ -37,8 +38,9 @@ class Smooth:
 class Grousers:
     """Bars across a wheel's rim, `height` (m) high, that carry sand to behind the wheel.
 
-    To a metre of travel they carry spin * width * height * fill (m^3); `fill` is the share of the space between them that
-    sand takes up, `spin` the rim's speed over the wheel's: 1 / (1 - i) for a wheel driven at the slip ratio i.
+    What they carry comes to lie in the cut behind the wheel: to a metre of travel spin * width * height * fill (m^3), as far
+    as that much is displaced. `fill` is the share of the space between them that sand takes up, `spin` the rim's speed over
+    the wheel's: 1 / (1 - i) for a wheel driven at the slip ratio i.
     """
 
     height: jax.Array | float = 0.005
@@ -66,6 +68,23 @@ class Wheel:
 def lowest(tool: Blade | Wheel) -> jax.Array:
     """The height of the tool's lowest point (m)."""
     return -jnp.asarray(tool.sinkage if isinstance(tool, Wheel) else tool.depth)
+
+
+def usable(tool: NoTool | Blade | Wheel) -> jax.Array:
+    """Whether the tool's numbers are finite and, for a wheel, make one; what is traced escapes `make_scene`."""
+    good = jnp.ones((), bool)
+    for leaf in jax.tree.leaves(tool):
+        good = good & jnp.all(jnp.isfinite(leaf))
+    if isinstance(tool, Wheel):
+        good = good & (tool.sinkage >= 0) & (tool.sinkage <= tool.radius)
+        good = good & (jnp.abs(tool.slip_angle) <= math.pi / 2 * (1 + 1e-6))
+    return good
+
+
+def half_chord(wheel: Wheel) -> jax.Array:
+    """Half of the wheel's chord at level sand, s = sqrt(h (2 r - h)) (m); at least a thousandth of the radius."""
+    r = jnp.asarray(wheel.radius)
+    return jnp.sqrt(jnp.maximum(wheel.sinkage * (2 * r - wheel.sinkage), 1e-6 * r * r))
 
 
 def extent(tool: Blade | Wheel) -> jax.Array:

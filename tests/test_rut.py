@@ -35,7 +35,7 @@ def test_every_row_is_there(table):
             for name in rut.FIGURES:
                 assert report["summary"][rule][reference][name] == pytest.approx(np.mean([row[name] for row in some]))
     assert report["not_scanned"] == [[67.5, 15.0]]
-    assert set(profiles) == {"own", "split", "closed-form", "exact", "measured"}
+    assert set(profiles) == {"own", "split", "closed-form", "exact", "measured", "measured-split"}
 
 
 def test_sections_are_steady_and_keep_their_area(table):
@@ -130,12 +130,15 @@ def test_the_command(tmp_path, monkeypatch, capsys):
         (["--rule", "other"], "rule: invalid choice"),
         (["--measured", "none.csv"], "measured: cannot read none.csv"),
         (["--measured", "deep.csv"], "measured: got a trench of beta 45 degrees, sinkage 80 mm"),
+        (["--out", ""], "out: got an empty name"),
+        (["--out", "taken"], "out: cannot write taken/trench.png, which is a folder"),
         (["--out", "deep.csv"], "out: cannot write to deep.csv"),
     ],
 )
 def test_bad_input(tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     points = "".join(f"45,80,1,{x},0\n" for x in range(30))
+    (tmp_path / "taken" / "trench.png").mkdir(parents=True)
     (tmp_path / "deep.csv").write_text("beta_deg,sinkage_mm,scan,x_mm,z_mm\n" + points)
     try:
         code = main(["trench", *arguments])

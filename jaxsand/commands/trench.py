@@ -1,18 +1,25 @@
 """`jaxsand trench`: the trenches of a wheel, beside what is known of them."""
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from jaxsand.commands.printing import show
 from jaxsand.files import as_json, as_table, folder, progress, written
 
+_FILES = ("profiles.csv", "trench.png", "trench-errors.png", "trench.json")
+
 
 def run_trench(options: argparse.Namespace) -> None:
     tell = progress()
-    if not 0.1 <= options.spacing_mm <= 20:
-        raise ValueError(f"spacing-mm: got {options.spacing_mm:g}; give millimetres from 0.1 to 20")
+    if not 0.25 <= options.spacing_mm <= 20:
+        raise ValueError(f"spacing-mm: got {options.spacing_mm:g}; give millimetres from 0.25 to 20")
     out = folder(options.out) if options.out else None
+    files = [out / name for name in _FILES] if out else []
+    for file in files:
+        if file.is_dir():
+            raise ValueError(f"out: cannot write {file}, which is a folder; choose another folder")
     from jaxsand import rut
     from jaxsand.scans import read_scans
 
@@ -24,17 +31,14 @@ def run_trench(options: argparse.Namespace) -> None:
         from jaxsand.render import save_figure
         from jaxsand.rutfigures import errors_figure, profiles_figure
 
-        files = [out / name for name in ("profiles.csv", "trench.png", "trench-errors.png", "trench.json")]
         report["files"] = [str(file) for file in files]
         tell("drawing")
-        with written(files[0]) as path:
-            _write_profiles(profiles, path)
-        with written(files[1]) as path:
-            save_figure(profiles_figure(profiles), path)
-        with written(files[2]) as path:
-            save_figure(errors_figure(profiles), path)
-        with written(files[3]) as path:
-            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+        with ExitStack() as all_of_them:  # take their places together
+            paths = [all_of_them.enter_context(written(file)) for file in files]
+            _write_profiles(profiles, paths[0])
+            save_figure(profiles_figure(profiles), paths[1])
+            save_figure(errors_figure(profiles), paths[2])
+            paths[3].write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     show(options, report, _table)
 
