@@ -126,7 +126,8 @@ def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Arr
     wheel = job.tool
     slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, half_chord(wheel)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
-    least_cos, least_sin = jnp.maximum(cos, 1e-6), jnp.maximum(sin, 1e-6)
+    least = float(jnp.finfo(h.dtype).eps)
+    least_cos, least_sin = jnp.maximum(cos, least), jnp.maximum(sin, least)
     slack = job.bed.spacing / (2 * _SAMPLES) * jnp.maximum(1 - 10 * sin, 0) / least_sin  # for samples at an upright flank
 
     def sample(k: jax.Array, total: jax.Array) -> jax.Array:
