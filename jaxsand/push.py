@@ -69,14 +69,21 @@ def arrived(push: SteppedPush, params: Any, k: jax.Array, _: Any) -> jax.Array:
     return k * push.substep * job.bed.spacing >= length
 
 
-def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> State:
-    """One sub-step: the blade clears what it newly covers to the front, and the sand settles around it."""
-    scene, job, start, length = params
+def step_ahead(
+    push: SteppedPush, job: Job, start: Pose, length: jax.Array, k: jax.Array
+) -> tuple[Pose, Pose, jax.Array, jax.Array]:
+    """The poses before and after sub-step k of a leg, the way between (m), and which part of a whole sub-step that is."""
     substep = push.substep * job.bed.spacing
     begin = k * substep
     ahead = jnp.minimum(substep, length - begin)
     pose = Pose(start.x + begin * start.cos, start.y + begin * start.sin, start.cos, start.sin)
-    end = Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin)
+    return pose, Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin), ahead, ahead / substep
+
+
+def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> State:
+    """One sub-step: the blade clears what it newly covers to the front, and the sand settles around it."""
+    scene, job, start, length = params
+    pose, end, ahead, part = step_ahead(push, job, start, length, k)
 
     def move(job: Job, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost, jax.Array]:
         # A hair less than what was covered, lest a rounded pose leave a hair of sand in the blade.
@@ -89,7 +96,7 @@ def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> Stat
         for _ in range(2):
             h, lost, carried = pass_on(job, share, 1 - swept, h, lost, carried)
         after = coverage(job.tool, end, job.x, job.y, job.bed.spacing)
-        flow = Flow(job.flow.rate * (among * ahead / substep), job.flow.quantum)
+        flow = Flow(job.flow.rate * (among * part), job.flow.quantum)
         h, lost = settle_around(job, flow, push.sweeps, after, h + carried, lost)
         return h, lost, swept
 

@@ -28,11 +28,11 @@ from jaxsand.displace import Hanging, Job, Shares, contact, outwards, pass_on, s
 from jaxsand.flux import NARROW
 from jaxsand.legs import Pushed, State, along_legs, over_the_map
 from jaxsand.loop import repeat_until
-from jaxsand.push import SteppedPush, arrived, in_window
+from jaxsand.push import SteppedPush, arrived, in_window, step_ahead
 from jaxsand.scene import Scene
 from jaxsand.swath import complete
 from jaxsand.sweep import Flow
-from jaxsand.tool import Grousers, Pose, half_chord, interval, local, rim, wheel_frame
+from jaxsand.tool import Pose, Smooth, carried_area, half_chord, interval, local, rim, wheel_frame
 
 _PASSES = 4  # how many cells sand under the wheel moves on in a sub-step
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it
@@ -56,11 +56,7 @@ def roll_along(
 def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> State:
     """One sub-step: what comes to lie above the rim leaves ahead, and the sand settles around the wheel."""
     scene, job, start, length = params
-    substep = push.substep * job.bed.spacing
-    begin = k * substep
-    ahead = jnp.minimum(substep, length - begin)
-    pose = Pose(start.x + begin * start.cos, start.y + begin * start.sin, start.cos, start.sin)
-    end = Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin)
+    pose, end, ahead, part = step_ahead(push, job, start, length, k)
 
     def move(job: Job, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost, jax.Array]:
         now = _over(job, end)
@@ -69,7 +65,7 @@ def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> Stat
         share = _leaving(job, end)
         for _ in range(_PASSES):
             h, lost, carried = pass_on(job, share, now, h, lost, carried)
-        return *_settle(job, push.sweeps, now, ahead / substep, h + carried, lost), now.cover
+        return *_settle(job, push.sweeps, now, part, h + carried, lost), now.cover
 
     return in_window(scene, job, pose, state, move)
 
@@ -135,11 +131,10 @@ def _leaving(job: Job, pose: Pose) -> Shares:
 
 def _carry_back(job: Job, pose: Pose, ahead: jax.Array, h: jax.Array, carried: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Grousers leave a part of what is displaced in the cut behind the wheel, over a quarter of its chord's length."""
-    grousers = job.tool.grousers
-    if not isinstance(grousers, Grousers):
-        return h, carried
     dx, wheel = job.bed.spacing, job.tool
-    asked = grousers.spin * wheel.width * grousers.height * grousers.fill * ahead / dx**2
+    if isinstance(wheel.grousers, Smooth):
+        return h, carried
+    asked = carried_area(wheel, wheel.grousers) * ahead / dx**2
     chord, slip = half_chord(wheel), jnp.abs(wheel.slip_angle)
     s, n = local(pose, job.x, job.y)
     end = -chord * jnp.cos(slip) - wheel.width / 2 * jnp.sin(slip)

@@ -93,12 +93,16 @@ def simulate_all(trenches: Iterable[Trench], spacing: float, push: Push, tell: T
         return {trenches[0]: first} | dict(zip(trenches[1:], pool.map(one, trenches[1:]), strict=True))
 
 
-def errors(profile: Callable, deepest: float, reference: Profile) -> dict[str, float]:
-    """Mean and median distance, every 0.5 mm between the reference's outer toes widened by 10 mm, and the difference of the
-    deepest points (mm)."""
+def distances(profile: Profile, reference: Profile) -> np.ndarray:
+    """How far apart (mm), every 0.5 mm between the reference's outer toes widened by 10 mm."""
     x = np.arange(reference.toes[0] - 0.01, reference.toes[1] + 0.01, 5e-4)
-    apart = np.abs(profile(x) - reference(x)) * 1e3
-    figures = float(apart.mean()), float(np.median(apart)), abs(deepest - reference.deepest) * 1e3
+    return np.abs(profile(x) - reference(x)) * 1e3
+
+
+def errors(profile: Profile, reference: Profile) -> dict[str, float]:
+    """The mean and the median of the `distances`, and the difference of the deepest points (mm)."""
+    apart = distances(profile, reference)
+    figures = float(apart.mean()), float(np.median(apart)), abs(profile.deepest - reference.deepest) * 1e3
     return dict(zip(FIGURES, figures, strict=True))
 
 
@@ -161,7 +165,7 @@ def experiment(
         for name, of in known.items():
             for trench, reference in of.items():
                 rut = ruts[trench]
-                figures = errors(rut.profile, rut.profile.deepest, reference)
+                figures = errors(rut.profile, reference)
                 cost = {"unsteady_mm": rut.unsteady * 1e3, "seconds": rut.seconds}
                 rows.append({**_named(trench), "rule": rule, "reference": name, **figures, **cost})
         if scans:
@@ -169,7 +173,7 @@ def experiment(
             profiles["measured" if "measured" not in profiles else f"measured-{rule}"] = laid
             rows += [{"rule": rule, **row} for row in more]
     baseline = [
-        {**_named(t), "rule": "exact", "reference": "closed-form", **errors(p, p.deepest, known["closed-form"][t])}
+        {**_named(t), "rule": "exact", "reference": "closed-form", **errors(p, known["closed-form"][t])}
         for t, p in known["exact"].items()
     ]
     means = partial(_means, rows + baseline)

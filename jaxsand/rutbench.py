@@ -17,6 +17,7 @@ from jaxsand.settling import settle
 from jaxsand.sim import act
 from jaxsand.split import SplitPush
 from jaxsand.tool import Wheel
+from jaxsand.trench import trimmed
 
 Tell = Callable[[str], None]
 SPACINGS = (4e-3, 2e-3, 1e-3, 5e-4)
@@ -42,18 +43,11 @@ def against_spacing(tell: Tell = lambda _: None, spacings: int = 4) -> list[dict
             for spacing, some in ruts.items():
                 if of is finest and spacing == SPACINGS[spacings - 1]:
                     continue
-                all_of_them = [errors(some[t].profile, some[t].profile.deepest, _toed(of[t])) for t in _SOME]
+                all_of_them = [errors(some[t].profile, trimmed(of[t], 1e-5)) for t in _SOME]
                 figures = {key: float(np.mean([row[key] for row in all_of_them])) for key in FIGURES}
                 seconds = float(np.median([some[t].seconds for t in _SOME[1:]]))
                 rows.append({"rule": rule, "against": name, "spacing_mm": spacing * 1e3, **figures, "seconds": seconds})
     return rows
-
-
-def _toed(profile: Any) -> Any:
-    """A simulated section between its toes."""
-    moved = np.flatnonzero(np.abs(profile.z) > 1e-5)
-    part = slice(max(moved[0] - 1, 0), moved[-1] + 2)
-    return type(profile)(profile.x[part], profile.z[part])
 
 
 def settling(tell: Tell = lambda _: None, turns: int = 5) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxsand.rut import ANGLES, SINKAGES, Trench
+from jaxsand.rut import ANGLES, SINKAGES, Trench, distances
 from jaxsand.trench import Profile
 
 if TYPE_CHECKING:
@@ -56,11 +56,7 @@ def errors_figure(profiles: dict[str, dict[Trench, Profile]]) -> "Figure":
         for rule in ("own", "split"):
             if rule not in profiles:
                 continue
-            apart = []
-            for trench, known in profiles[reference].items():
-                x = np.arange(known.toes[0] - 0.01, known.toes[1] + 0.01, 5e-4)
-                apart.append(np.abs(profiles[rule][trench](x) - known(x)) * 1e3)
-            points = np.concatenate(apart)
+            points = np.concatenate([distances(profiles[rule][t], known) for t, known in profiles[reference].items()])
             share = np.full(points.size, 1 / points.size)
             look = _LOOKS[rule]
             ax.hist(points, bins, weights=share, histtype="step", color=look["color"], lw=1.6, label=look["label"])

@@ -23,7 +23,7 @@ from jaxsand.displace import Job, whole
 from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
 from jaxsand.scene import Scene
 from jaxsand.swath import ROOM, complete, hat, typical_drop, wedge
-from jaxsand.tool import Grousers, Pose, Wheel, half_chord, local, reach
+from jaxsand.tool import Grousers, Pose, Wheel, carried_area, half_chord, local, reach
 from jaxsand.window import Whole
 
 _SAMPLES = 8  # of the cut, along each side of a cell
@@ -99,8 +99,7 @@ def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     flanks, middle = 4 / 3 * flank * wheel.sinkage, wheel.sinkage * rim
     alike = (slip < _TEN) | (jnp.abs(slip - math.pi / 2) < _TEN) | (flanks <= middle)
     if isinstance(wheel.grousers, Grousers):
-        asked = wheel.grousers.spin * wheel.width * wheel.grousers.height * wheel.grousers.fill
-        behind = jnp.minimum(asked, jnp.where(alike, flanks + middle, middle))
+        behind = jnp.minimum(carried_area(wheel, wheel.grousers), jnp.where(alike, flanks + middle, middle))
         floor = -_floor(jnp.asarray(wheel.sinkage), middle, flanks, behind)
         middle = middle - behind
     else:

@@ -87,6 +87,11 @@ def half_chord(wheel: Wheel) -> jax.Array:
     return jnp.sqrt(jnp.maximum(wheel.sinkage * (2 * r - wheel.sinkage), 1e-6 * r * r))
 
 
+def carried_area(wheel: Wheel, grousers: Grousers) -> jax.Array:
+    """What the grousers of a wheel carry to behind it to a unit of travel (m^2)."""
+    return jnp.asarray(grousers.spin * wheel.width * grousers.height * grousers.fill)
+
+
 def extent(tool: Blade | Wheel) -> jax.Array:
     """How high or low the tool can bring sand (m), in order of magnitude; sets the precision of a push."""
     return jnp.asarray(tool.radius) if isinstance(tool, Wheel) else jnp.abs(jnp.asarray(tool.depth))

@@ -112,11 +112,12 @@ class Pass:
         if filled == 0:
             return self.sinkage
 
-        def short(depth: float) -> float:
-            inside = math.sqrt(1 - depth / self.sinkage)
-            return self.rim * (self.sinkage - depth) + 4 / 3 * self.flank * self.sinkage * inside**3 - filled
+        def short(inside: float) -> float:
+            return self.sinkage * (self.rim * inside**2 + 4 / 3 * self.flank * inside**3) - filled
 
-        return float(brentq(short, 0.0, self.sinkage, xtol=1e-18, rtol=1e-15)) if short(0.0) > 0 else 0.0
+        # In the share of a flank that is filled, which is as well resolved at any sinkage.
+        inside = float(brentq(short, 0.0, 1.0, xtol=1e-16, rtol=1e-15)) if short(1.0) > 0 else 1.0
+        return self.sinkage * (1 - inside**2)
 
 
 @dataclass(frozen=True)
@@ -240,11 +241,13 @@ def relaxed(runs: list[Pass], spacing: float = 5e-4) -> list[Profile]:
         end = settle_batch(scene, jnp.asarray(start, jnp.float64), scheme=SuperTimeStepping(0.05, 1 / 64), stop=stop)
         heights = np.asarray(end.height)[:, 0]
     x = (edges[1:] + edges[:-1]) / 2
-    return [_trimmed(x, z) for z in heights]
+    return [trimmed(Profile(x, z), 1e-9 * float(np.abs(z).max())) for z in heights]
 
 
-def _trimmed(x: np.ndarray, z: np.ndarray) -> Profile:
-    moved = np.flatnonzero(np.abs(z) > 1e-9 * np.abs(z).max())
+def trimmed(profile: Profile, least: float) -> Profile:
+    """The profile from toe to toe, where it is more than `least` (m) off level."""
+    x, z = profile.x, profile.z
+    moved = np.flatnonzero(np.abs(z) > least)
     if not moved.size:
         return Profile(x[[0, -1]], z[[0, -1]])
     part = slice(max(moved[0] - 1, 0), moved[-1] + 2)

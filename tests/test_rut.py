@@ -87,7 +87,7 @@ def test_the_window_that_follows_the_wheel_changes_nothing_that_matters(monkeypa
 def test_errors_are_exact_for_known_differences():
     known = rut.references([(0.0, 15.0)])["closed-form"][0.0, 15.0]
     lower = type(known)(known.x, known.z - 1e-3)
-    figures = rut.errors(lower, lower.deepest, known)
+    figures = rut.errors(lower, known)
     assert figures["median_abs_mm"] == pytest.approx(1)
     assert figures["depth_error_mm"] == pytest.approx(1)
 
