@@ -12,12 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
 from jaxsand.flux import stand
-from jaxsand.loop import repeat_until
-from jaxsand.sweep import Flow, sweep
+from jaxsand.loop import Plain, repeat, repeat_until
+from jaxsand.sweep import Flow, Sweep
 from jaxsand.tool import Pose, local
 
 _EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
@@ -111,7 +110,7 @@ def spread(
 ) -> tuple[jax.Array, Lost]:
     """Hands `carried` on until all of it rests."""
     rows, columns = h.shape
-    (h, lost, carried), _ = repeat_until(_at_rest, _onward, rows + columns, (job, share, free), (h, lost, carried))
+    (h, lost, carried), _ = repeat_until(_at_rest, Plain(_onward), rows + columns, (job, share, free), (h, lost, carried))
     return h + carried, lost
 
 
@@ -127,8 +126,7 @@ def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
 def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
     """Sweeps the sand around a blade that covers the share `cover` of each cell."""
     around = stand(cover, job.bottom)
-    state = (halo(h), lost)
-    h, lost = lax.fori_loop(0, sweeps, lambda _, s: sweep(job.bed, flow, around, *s), state)
+    h, lost = repeat(Sweep(), sweeps, (job.bed, flow, around), (halo(h), lost))
     return at(h), lost
 
 

@@ -11,11 +11,12 @@ import numpy as np
 from jax import lax
 
 from jaxsand.bed import Bed, Lost, grain, truncate
-from jaxsand.flux import Fluxes, Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
 from jaxsand.grid import links
-from jaxsand.loop import repeat_until
+from jaxsand.loop import Plain, Step, repeat, repeat_until
 from jaxsand.schemes import Pairwise, Relaxation, Schedule
-from jaxsand.sweep import Flow, apply, surge, sweep
+from jaxsand.surge import Surges
+from jaxsand.sweep import Flow, Sweep, apply
 
 Sand = tuple[jax.Array, Lost]  # a map with halo, and what it lost over the rim
 
@@ -30,7 +31,7 @@ class March:
     """
 
     begin: Callable[[Sand], Any]
-    body: Callable
+    body: Step
     done: Callable
     between: Callable[[jax.Array], Any]
     params: Any
@@ -60,14 +61,14 @@ def march(
     rate: Any
     if isinstance(scheme, Schedule):
         begin = partial(_with_momentum, bed)
-        body = partial(_steps, scheme, interval)
+        body = Surges(scheme, interval)
         rate = float(scheme.rates[-1])
         done = partial(_still_after_a_step, scheme, interval)
         between = partial(_between_steps, scheme, interval)
         params: Any = (bed, around, tolerance)
     else:
         begin = _as_it_is
-        body = partial(_pairs if isinstance(scheme, Pairwise) else _sweeps, interval)
+        body = Plain(partial(_pairs if isinstance(scheme, Pairwise) else _sweeps, interval))
         rate = scheme.share / 2 if isinstance(scheme, Pairwise) else scheme.rate
         done, between = _still, _always
         params = (bed, around, tolerance, rate)
@@ -120,32 +121,13 @@ def _between_steps(plan: Schedule, interval: int, k: jax.Array) -> jax.Array:
 def _sweeps(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
     bed, around, _, rate = params
     flow = Flow(jnp.asarray(rate), grain(bed, state[0]))
-    return lax.fori_loop(0, interval, lambda _, s: sweep(bed, flow, around, *s), state)
-
-
-def _steps(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any) -> Any:
-    bed, around, _ = params
-    dtype = state[0].dtype
-    cut = grain(bed, state[0])
-    starts = jnp.asarray(plan.starts)[:, None]
-    now = (k * interval + jnp.arange(interval, dtype=jnp.int32))[None, :]
-    begun = starts <= now
-    taken = (now[0] - jnp.max(jnp.where(begun, starts, 0), axis=0)).astype(dtype)  # stages of the same step before this one
-    rates = jnp.asarray(plan.rates, dtype)[jnp.sum(begun, axis=0) - 1] * (2 - 1 / (taken + 1))
-    momenta = taken / (taken + 1)
-
-    def stage(i: jax.Array, s: tuple[jax.Array, Lost, Fluxes]) -> tuple[jax.Array, Lost, Fluxes]:
-        return surge(bed, Flow(rates[i], cut), momenta[i], around, s)
-
-    u, lost, last = state
-    u, lost, last = lax.fori_loop(0, interval, stage, (u, lost, tuple(m / cut for m in last)))
-    return u, lost, tuple(m * cut for m in last)
+    return repeat(Sweep(), interval, (bed, flow, around), state)
 
 
 def _pairs(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
     bed, _, _, half = params
     flow = Flow(jnp.asarray(half), grain(bed, state[0]))
-    return lax.fori_loop(0, interval, lambda _, s: _each_pair(bed, flow, *s), state)
+    return repeat(_EACH_PAIR, interval, (bed, flow), state)
 
 
 def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
@@ -162,3 +144,6 @@ def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
         return u, lost
     drain = truncate(fluxes(bed, Nothing(), u)[-1] * (scale / 2))  # a cell has up to four sides
     return apply(bed, flow, (*fluxes_zero(bed, u)[:-1], drain), u, lost)
+
+
+_EACH_PAIR = Plain(lambda params, _, state: _each_pair(*params, *state))

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxsand.bed import Lost
 from jaxsand.displace import Job, contact, pass_on, radial, settle_around, shares, spread, take
 from jaxsand.legs import Pushed, State, along_legs, over_the_map
-from jaxsand.loop import repeat_until
+from jaxsand.loop import Plain, repeat_until
 from jaxsand.scene import Scene
 from jaxsand.sweep import Flow
 from jaxsand.tool import Pose, coverage
@@ -60,7 +60,7 @@ def _leg(scene: Scene, push: SteppedPush, job: Job, pose: Pose, length: jax.Arra
     # make_scene holds the thickness below the map's diagonal, so twice the diagonal is enough.
     bound = math.ceil((2 * math.hypot(*scene.grid.shape) + 3) / push.substep)
     params = (scene, job, start, length)
-    state, _ = repeat_until(partial(arrived, push), partial(_advance, push), bound, params, state)
+    state, _ = repeat_until(partial(arrived, push), Plain(partial(_advance, push)), bound, params, state)
     return state
 
 

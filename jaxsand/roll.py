@@ -27,7 +27,7 @@ from jaxsand.bed import Lost
 from jaxsand.displace import Hanging, Job, Shares, contact, outwards, pass_on, settle_around, shares, spread, whole
 from jaxsand.flux import NARROW
 from jaxsand.legs import Pushed, State, along_legs, over_the_map
-from jaxsand.loop import repeat_until
+from jaxsand.loop import Plain, repeat_until
 from jaxsand.push import SteppedPush, arrived, in_window, step_ahead
 from jaxsand.scene import Scene
 from jaxsand.swath import complete
@@ -48,7 +48,7 @@ def roll_along(
         start, length = over_the_map(scene, job, pose, length)
         bound = math.ceil((4 * math.hypot(*scene.grid.shape) + 3) / push.substep)
         params = (scene, job, start, length)
-        return repeat_until(partial(arrived, push), partial(_advance, push), bound, params, state)[0]
+        return repeat_until(partial(arrived, push), Plain(partial(_advance, push)), bound, params, state)[0]
 
     return along_legs(scene, height, path, push.rate, leg, record)
 

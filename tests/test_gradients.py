@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.loop import repeat_until
+from jaxsand.loop import Plain, repeat_until
 
 from .conftest import ANGLE
 
@@ -102,7 +102,7 @@ def test_the_loop_stops_where_told_and_is_differentiated_as_its_steps(bound):
         return p * x + jnp.sin(x) / 10 + 0.01 * k
 
     def looped(p, x):
-        return repeat_until(lambda p, k, x: x > 3, body, bound, p, x)
+        return repeat_until(lambda p, k, x: x > 3, Plain(body), bound, p, x)
 
     p, x = jnp.asarray(1.1), jnp.asarray(0.5)
     end, count = looped(p, x)

@@ -11,12 +11,13 @@ README = Path(__file__).parent.parent / "README.md"
 
 # A file imports only from floors below its own, and never from a neighbour. A folder has a floor, and floors inside.
 FLOORS = [
-    {"grid", "material", "walls", "window", "tool", "loop"},
-    {"scene"},
+    {"grid", "material", "walls", "window", "tool", "lockstep"},
+    {"scene", "loop"},
     {"bed", "schemes", "forces"},
-    {"flux", "rules"},
+    {"flux", "rules", "adjoint"},
     {"sweep"},
-    {"march", "displace"},
+    {"surge", "displace"},
+    {"march"},
     {"levels", "batch", "legs"},
     {"settling"},
     {"push", "swath", "trench"},

@@ -1,0 +1,121 @@
+"""The derivative of a sweep where sand flows in pairs: links that are steeper than repose pass tangents on, others nothing.
+
+With 4 or 8 neighbours a sweep is piecewise linear. With s the surface, D its steps over the links, G = -D^T what cells gain
+from fluxes, A the links that are active, sigma = +-1 the side to which they are steeper than m, and c the rate over a link's
+length (times how open it is), it reads u + G c A (D s - sigma m), so that
+
+    du'     = du + G c A (D ds - sigma dm)              forwards
+    lambda  = lambda' + S^T G c A D lambda'             backwards, ds = S du,
+    mu      = sum of c A sigma D lambda'                for m.
+
+Links of all directions are kept on one lattice [H + 1, W + 1], on whose point (i, j) the cells (i, j) to (i + 1, j + 1) of a
+map with halo meet; two bits for each link say whether it is active, and to which side.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsand.bed import Bed, halo
+from jaxsand.grid import links
+
+Lattice = tuple[jax.Array, ...]  # a map [H + 1, W + 1] for each direction of links
+_CORNERS = {(0, 1): (0, 1), (1, 0): (0, 2), (1, 1): (0, 3), (1, -1): (1, 2)}
+
+
+def _around(u: jax.Array) -> tuple[jax.Array, ...]:
+    """The four cells of a map with halo that meet at each point."""
+    return u[:-1, :-1], u[:-1, 1:], u[1:, :-1], u[1:, 1:]
+
+
+def pairs(bed: Bed, u: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+    """The first and the second cell of every link, for each direction."""
+    cells = _around(u)
+    return [(cells[_CORNERS[di, dj][0]], cells[_CORNERS[di, dj][1]]) for di, dj, _ in links(bed.neighbours)]
+
+
+def steps(bed: Bed, u: jax.Array) -> Lattice:
+    """The step over every link, from its first to its second cell."""
+    return tuple(there - here for here, there in pairs(bed, u))
+
+
+def gains(bed: Bed, flow: Lattice) -> jax.Array:
+    """What each cell [H, W] gains from flows towards the links' first cells."""
+    net: jax.Array | float = 0.0
+    for (di, dj, _), f in zip(links(bed.neighbours), flow, strict=True):
+        beside = _around(f)  # a cell is corner 3 of the point before it, and corner 0 of its own
+        first, second = _CORNERS[di, dj]
+        net = net + (beside[3 - first] - beside[3 - second])
+    return jnp.asarray(net)
+
+
+def yields(bed: Bed) -> Lattice | tuple[jax.Array, ...]:
+    """The largest stable step over every link; one number for each direction where the angle is everywhere the same."""
+    if not bed.drop.ndim:
+        return tuple(bed.drop * length for _, _, length in links(bed.neighbours))
+    both = pairs(bed, halo(bed.drop, 0.0))
+    return tuple((a + b) * (length / 2) for (a, b), (_, _, length) in zip(both, links(bed.neighbours), strict=True))
+
+
+def active(bed: Bed, s: jax.Array) -> jax.Array:
+    """Two bits for each link: steeper than repose upwards, or downwards; the low byte of integers [H + 1, W + 1]."""
+    code = jnp.zeros((), jnp.int32)
+    for k, (d, m) in enumerate(zip(steps(bed, s), yields(bed), strict=True)):
+        code = code | jnp.where(d > m, 1 << 2 * k, jnp.where(d < -m, 2 << 2 * k, 0))
+    return code
+
+
+def opened(bed: Bed, gate: jax.Array | None) -> list[Any]:
+    """What of a surface's excess flows over each link at rate 1."""
+    lengths = [1 / length for _, _, length in links(bed.neighbours)]
+    if gate is None:
+        return lengths
+    return [jnp.minimum(here, there) * w for (here, there), w in zip(pairs(bed, gate), lengths, strict=True)]
+
+
+def upward(code: jax.Array, link: int) -> jax.Array:
+    return (code & (1 << 2 * link)) != 0
+
+
+def downward(code: jax.Array, link: int) -> jax.Array:
+    return (code & (2 << 2 * link)) != 0
+
+
+def moving(code: jax.Array, link: int) -> jax.Array:
+    return (code & (3 << 2 * link)) != 0
+
+
+def to_lattice(bed: Bed, flow: tuple[jax.Array, ...]) -> Lattice:
+    """Maps over links as flux.py keeps them, on the lattice."""
+    along_x, along_y, *diagonal = flow
+    return (jnp.pad(along_x, ((1, 0), (0, 0))), jnp.pad(along_y, ((0, 0), (1, 0))), *diagonal)
+
+
+def from_lattice(bed: Bed, flow: Lattice) -> tuple[jax.Array, ...]:
+    along_x, along_y, *diagonal = flow
+    return (along_x[1:], along_y[:, 1:], *diagonal)
+
+
+def drop_cotangent(bed: Bed, parts: list[jax.Array]) -> jax.Array:
+    """The cotangent of `bed.drop` from those of the largest stable steps over every link, maps."""
+    if not bed.drop.ndim:
+        both = [p * length for p, (_, _, length) in zip(parts, links(bed.neighbours), strict=True)]
+        return jnp.sum(jnp.asarray(sum(both)))
+    return jax.vjp(lambda drop: yields(replace(bed, drop=drop)), bed.drop)[1](tuple(parts))[0]
+
+
+def to_less_open(bed: Bed, gate: jax.Array, parts: list[jax.Array]) -> jax.Array:
+    """The cotangent of a map with halo whose least value of both cells gates each link."""
+    net: jax.Array | float = 0.0
+    for (di, dj, _), (here, there), part in zip(links(bed.neighbours), pairs(bed, gate), parts, strict=True):
+        first, second = _CORNERS[di, dj]
+        less = here <= there
+        net = net + _around(jnp.where(less, part, 0))[3 - first] + _around(jnp.where(less, 0, part))[3 - second]
+    return halo(jnp.asarray(net), 0.0)
+
+
+def to_shape(cotangent: jax.Array, like: jax.Array) -> jax.Array:
+    """The cotangent of what was broadcast to a map."""
+    return cotangent if like.ndim else jnp.sum(cotangent)

@@ -1,0 +1,195 @@
+"""Loops of a batch of maps in lockstep, each until it is done: how loop.py runs under `vmap`.
+
+The step's number is one number, not one for each map, and the tape that reverse mode reads is written in place.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+
+Tree = Any
+Done = Callable[[Tree, jax.Array, Tree], jax.Array]
+TAPE = 64  # steps kept at hand for reverse mode; of a longer loop they are restored from a state kept for so many steps
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """A loop over `lanes` leading axes of the state in lockstep."""
+
+    done: Done | None
+    step: Any
+    bound: int
+    lanes: int
+
+    @property
+    def room(self) -> int:
+        """How many records the tape holds."""
+        return max(1, min(self.bound, TAPE))
+
+    def over(self, axes: Tree) -> "Lanes":
+        """The loop over one more leading axis of the state and of those params whose axis is 0."""
+        done = None if self.done is None else jax.vmap(self.done, in_axes=(axes, None, 0))
+        return Lanes(done, _Many(self.step, axes), self.bound, self.lanes + 1)
+
+    def ready(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
+        over = k >= self.bound
+        return over if self.done is None else over | self.done(params, k, state)
+
+    def taken(self, count: jax.Array) -> jax.Array | None:
+        """What is said of the number of steps; nothing where that is known."""
+        return None if self.done is None else count
+
+    def total(self, count: jax.Array | None) -> jax.Array:
+        """The largest number of steps in any lane."""
+        return jnp.int32(self.bound) if count is None else jnp.max(count)
+
+    def beyond(self, k: jax.Array, count: jax.Array | None) -> jax.Array:
+        """The lanes in which step k was not taken."""
+        return jnp.zeros((), bool) if count is None else k >= count
+
+    def keep(self, ready: jax.Array, old: Tree, new: Tree) -> Tree:
+        """The old state in the lanes that are ready."""
+        if not self.lanes or not ready.ndim:
+            return new
+        return jax.tree.map(
+            lambda x, y: jnp.where(ready.reshape(ready.shape + (1,) * (x.ndim - self.lanes)), x, y), old, new
+        )
+
+    def put(self, tape: Tree, k: jax.Array, record: Tree) -> Tree:
+        return jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, k, self.lanes), tape, record)
+
+    def get(self, tape: Tree, k: jax.Array) -> Tree:
+        return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, k, self.lanes, keepdims=False), tape)
+
+    def blank(self, n: int, record: Tree) -> Tree:
+        def zeros(x: jax.Array) -> jax.Array:
+            return jnp.zeros((*x.shape[: self.lanes], n, *x.shape[self.lanes :]), x.dtype)
+
+        return jax.tree.map(zeros, record)
+
+
+class _Many:
+    """A step over one more leading axis."""
+
+    def __init__(self, step: Any, axes: Tree) -> None:
+        self.call = jax.vmap(step, in_axes=(axes, None, 0))
+        self.recorded = jax.vmap(step.recorded, in_axes=(axes, None, 0))
+        self.push = jax.vmap(step.push, in_axes=(axes, None, 0, 0, 0))
+        self.pull = jax.vmap(step.pull, in_axes=(axes, None, 0, 0))
+
+    def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree:
+        return self.call(params, k, state)
+
+
+def batched(program: Callable, loop: Lanes, params: Tree, *rest: Tree) -> Tree:
+    """`program(loop, params, *rest)`, which under `vmap` is the program over one more lane; all of `rest` gains the axis."""
+
+    @custom_vmap
+    def run(params: Tree, rest: Tree) -> Tree:
+        return program(loop, params, *rest)
+
+    @run.def_vmap
+    def rule(size: int, mapped: list, params: Tree, rest: Tree) -> tuple[Tree, Tree]:
+        axes = jax.tree.map(lambda yes: 0 if yes else None, mapped[0])
+        rest = jax.tree.map(lambda yes, x: x if yes else jnp.broadcast_to(x, (size, *x.shape)), mapped[1], rest)
+        out = batched(program, loop.over(axes), params, *rest)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return run(params, rest)
+
+
+def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
+    """The state at the end, and the steps that took."""
+
+    def advance(carry: Tree) -> Tree:
+        state, k, count, ready = carry
+        state = loop.keep(ready, state, loop.step(params, k, state))
+        k, count = k + 1, count + ~ready
+        return state, k, count, ready | loop.ready(params, k, state)
+
+    zero = jnp.int32(0)
+    ready = loop.ready(params, zero, state)
+    state, _, count, _ = lax.while_loop(
+        lambda c: ~jnp.all(c[3]), advance, (state, zero, jnp.zeros(ready.shape, jnp.int32), ready)
+    )
+    return state, loop.taken(count)
+
+
+def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
+    """`run`, with the records of the last stretch of steps and the state before every stretch."""
+
+    def advance(carry: Tree) -> Tree:
+        state, k, count, ready, tape = carry
+        new, record = loop.step.recorded(params, k, state)
+        tape = loop.put(tape, k % loop.room, record)
+        state = loop.keep(ready, state, new)
+        k, count = k + 1, count + ~ready
+        return state, k, count, ready | loop.ready(params, k, state), tape
+
+    def stretch(carry: Tree) -> Tree:
+        carry, saved = carry
+        saved = loop.put(saved, carry[1] // loop.room, carry[0])
+        last = carry[1] + loop.room
+        return lax.while_loop(lambda c: (c[1] < last) & ~jnp.all(c[3]), advance, carry), saved
+
+    zero = jnp.int32(0)
+    ready = loop.ready(params, zero, state)
+    _, record = jax.eval_shape(loop.step.recorded, params, zero, state)
+    carry = (state, zero, jnp.zeros(ready.shape, jnp.int32), ready, loop.blank(loop.room, record))
+    if loop.bound <= loop.room:
+        state, _, count, _, tape = lax.while_loop(lambda c: ~jnp.all(c[3]), advance, carry)
+        return state, loop.taken(count), tape, ()
+    saved = loop.blank(-(-loop.bound // loop.room), state)
+    (state, _, count, _, tape), saved = lax.while_loop(lambda c: ~jnp.all(c[0][3]), stretch, (carry, saved))
+    return state, loop.taken(count), tape, saved
+
+
+def push(loop: Lanes, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
+    def push(k: jax.Array, carry: Tree) -> Tree:
+        x, dx = carry
+        new, record = loop.step.recorded(params, k, x)
+        dnew = loop.step.push(params, k, record, dparams, dx)
+        return loop.keep(loop.beyond(k, count), carry, (new, dnew))
+
+    return lax.fori_loop(0, loop.total(count), push, (state, dstate))[1]
+
+
+def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, saved: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+    total = loop.total(count)
+
+    def pull(first: jax.Array, steps: jax.Array, tape: Tree, carry: Tree) -> Tree:
+        def one(j: jax.Array, carry: Tree) -> Tree:
+            j = steps - 1 - j
+            k = first + j
+            cf, cx = carry
+            df, dx = loop.step.pull(params, k, loop.get(tape, j), cx)
+            return loop.keep(loop.beyond(k, count), carry, (jax.tree.map(jnp.add, cf, df), dx))
+
+        return lax.fori_loop(0, steps, one, carry)
+
+    floats = jax.eval_shape(loop.step.pull, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
+    carry = (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), floats), cotangent)
+    if loop.bound <= loop.room:
+        return pull(jnp.int32(0), total, tape, carry)
+
+    def restore(first: jax.Array, tape: Tree) -> Tree:
+        def one(j: jax.Array, c: Tree) -> Tree:
+            new, record = loop.step.recorded(params, first + j, c[0])
+            return loop.keep(loop.beyond(first + j, count), c[0], new), loop.put(c[1], j, record)
+
+        steps = jnp.where(first < 0, 0, loop.room)
+        return lax.fori_loop(0, steps, one, (loop.get(saved, jnp.maximum(first, 0) // loop.room), tape))[1]
+
+    def stretch(i: jax.Array, carry: Tree) -> Tree:
+        tape, carry = carry
+        first = (stretches - 1 - i) * loop.room
+        carry = pull(first, jnp.minimum(loop.room, total - first), tape, carry)
+        return restore(first - loop.room, tape), carry
+
+    stretches = (total + loop.room - 1) // loop.room
+    return lax.fori_loop(0, stretches, stretch, (tape, carry))[1]

@@ -1,0 +1,157 @@
+"""Super-time-stepping as a step of a loop: sweeps with momentum, and their derivative from a byte a cell and sweep."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxsand import adjoint
+from jaxsand.bed import Bed, at, grain, halo
+from jaxsand.flux import Nothing, Partial
+from jaxsand.loop import Plain, repeat, split
+from jaxsand.schemes import Schedule
+from jaxsand.sweep import Flow, surge
+
+
+@dataclass(frozen=True)
+class Surges:
+    """Group k of `interval` sweeps of a schedule; `params` are the bed, the cells and limits that it does not use.
+
+    Where sand flows in pairs over no rim it leaves two bits for each link and sweep on the tape, from which adjoint.py tells
+    the derivative; elsewhere the state before the group, fluxes included.
+    """
+
+    plan: Schedule
+    interval: int
+
+    def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
+        bed, around, _ = params
+        rates, momenta = self._stages(k, state[0].dtype)
+        cut = grain(bed, state[0])
+        u, lost, last = state
+        state = (u, lost, tuple(m / cut for m in last))
+        u, lost, last = repeat(_SURGE, self.interval, (bed, around, rates, momenta, cut), state)
+        return u, lost, tuple(m * cut for m in last)
+
+    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+        bed, around, _ = params
+        if not _by_links(bed):
+            return Plain(self).recorded(params, k, state)
+        rates, momenta = self._stages(k, state[0].dtype)
+        cut = grain(bed, state[0])
+
+        def stage(i: jax.Array, carry: Any) -> Any:
+            state, codes = carry
+            word = lax.dynamic_index_in_dim(codes, i // 4, keepdims=False)
+            code = adjoint.active(bed, _surface(around, state[0])) << (8 * (i % 4)).astype(jnp.int32)
+            codes = lax.dynamic_update_index_in_dim(codes, word | code, i // 4, 0)
+            return surge(bed, Flow(rates[i], cut), momenta[i], around, state), codes
+
+        u, lost, last = state
+        rows, columns = u.shape
+        codes = jnp.zeros((-(-self.interval // 4), rows - 1, columns - 1), jnp.int32)
+        (u, lost, last), codes = lax.fori_loop(0, self.interval, stage, ((u, lost, tuple(m / cut for m in last)), codes))
+        return (u, lost, tuple(m * cut for m in last)), codes
+
+    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+        bed, around, _ = params
+        if not _by_links(bed):
+            return Plain(self).push(params, k, record, dparams, dstate)
+        rates, momenta = self._stages(k, dstate[0].dtype)
+        dbed = split(params)[1](dparams)[0]
+        weights = adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
+        dyields = jax.jvp(lambda drop: adjoint.yields(replace(bed, drop=drop)), (bed.drop,), (dbed.drop,))[1]
+
+        def stage(i: jax.Array, carry: Any) -> Any:
+            dh, last = carry
+            code, moved = _code(record, i), []
+            for n, (step, dm, w) in enumerate(
+                zip(adjoint.steps(bed, halo(_ease(around, dh), 0.0)), dyields, weights, strict=True)
+            ):
+                beyond = jnp.where(adjoint.upward(code, n), step - dm, jnp.where(adjoint.downward(code, n), step + dm, 0))
+                moved.append(rates[i] * w * beyond + momenta[i] * last[n])
+            moved = lax.optimization_barrier(tuple(moved))
+            return dh + adjoint.gains(bed, moved), moved
+
+        last = adjoint.to_lattice(bed, dstate[2])
+        dh, last = lax.fori_loop(0, self.interval, stage, (at(dstate[0]), last))
+        return halo(dh, 0.0), None, adjoint.from_lattice(bed, last)
+
+    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+        bed, around, _ = params
+        if not _by_links(bed):
+            return Plain(self).pull(params, k, record, cotangent)
+        rates, momenta = self._stages(k, cotangent[0].dtype)
+        weights = adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
+        lengths = adjoint.opened(bed, None)
+        stretch = weights if bed.drop.ndim else [w / v for w, v in zip(weights, lengths, strict=True)]
+
+        def stage(j: jax.Array, carry: Any) -> Any:
+            i = self.interval - 1 - j
+            gain, last, tilt = carry
+            again = jnp.where(j > 0, momenta[jnp.minimum(i + 1, self.interval - 1)], 1)
+            again, rate = lax.optimization_barrier((again, rates[i]))
+            code = _code(record, i)
+            back = [y + again * p for y, p in zip(adjoint.steps(bed, halo(gain, 0.0)), last, strict=True)]
+            back = lax.optimization_barrier(back)
+            onward = [
+                w * jnp.where(adjoint.moving(code, n), y, 0) for n, (w, y) in enumerate(zip(weights, back, strict=True))
+            ]
+            signed = [
+                s * jnp.where(adjoint.upward(code, n), y, jnp.where(adjoint.downward(code, n), -y, 0))
+                for n, (y, s) in enumerate(zip(back, stretch, strict=True))
+            ]
+            if not bed.drop.ndim:
+                signed = [sum(signed)]
+            tilt = [t + rate * s for t, s in zip(tilt, signed, strict=True)]
+            return gain + rate * _ease(around, adjoint.gains(bed, tuple(onward))), back, tilt
+
+        gain = at(cotangent[0])
+        last = [-p for p in adjoint.to_lattice(bed, cotangent[2])]
+        tilt = [jnp.zeros_like(last[0])] * (len(last) if bed.drop.ndim else 1)
+        gain, last, tilt = lax.fori_loop(0, self.interval, stage, (gain, last, tilt))
+        last = [momenta[0] * y for y in last]
+        dparams = jax.tree.map(jnp.zeros_like, params)
+        drop = adjoint.drop_cotangent(bed, tilt) if bed.drop.ndim else jnp.sum(tilt[0])
+        floats = split((replace(dparams[0], drop=drop), *dparams[1:]))[0]
+        return floats, (halo(gain, 0.0), None, adjoint.from_lattice(bed, tuple(-p for p in last)))
+
+    def _stages(self, k: jax.Array, dtype: Any) -> tuple[jax.Array, jax.Array]:
+        """The rates and the momenta of the group's sweeps."""
+        starts = jnp.asarray(self.plan.starts)[:, None]
+        now = (k * self.interval + jnp.arange(self.interval, dtype=jnp.int32))[None, :]
+        begun = starts <= now
+        taken = (now[0] - jnp.max(jnp.where(begun, starts, 0), axis=0)).astype(
+            dtype
+        )  # stages of the same step before this one
+        rates = jnp.asarray(self.plan.rates, dtype)[jnp.sum(begun, axis=0) - 1] * (2 - 1 / (taken + 1))
+        return rates, taken / (taken + 1)
+
+
+def _code(codes: jax.Array, i: jax.Array) -> jax.Array:
+    """What sweep i left on the tape, of which a word of 32 bits holds four."""
+    word, shift = lax.optimization_barrier((lax.dynamic_index_in_dim(codes, i // 4, keepdims=False), 8 * (i % 4)))
+    return lax.shift_right_logical(word, jnp.full(word.shape, shift, word.dtype))
+
+
+def _by_links(bed: Bed) -> bool:
+    return bed.neighbours != "isotropic" and bed.rim is None
+
+
+def _surface(around: Nothing | Partial, u: jax.Array) -> jax.Array:
+    return u if isinstance(around, Nothing) else halo(around.surface(at(u)))
+
+
+def _ease(around: Nothing | Partial, change: jax.Array) -> jax.Array:
+    """The surface's change for a change of what cells hold; symmetric."""
+    return change if isinstance(around, Nothing) else around.surface(change)
+
+
+def _surge(params: Any, i: jax.Array, state: Any) -> Any:
+    bed, around, rates, momenta, cut = params
+    return surge(bed, Flow(rates[i], cut), momenta[i], around, state)
+
+
+_SURGE = Plain(_surge)
