@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jaxsand import strokebench
+from jaxsand.__main__ import main
 from jaxsand.rules import Outcome
 from jaxsand.sim import rollout
-from jaxsand.strokebench import reached, run_all, stroke_goal
+from jaxsand.strokebench import letters_on_rough_sand, many_strokes, reached, run_all, stroke_goal, turned_letters
 from jaxsand.strokefigures import strokes_figure
 from jaxsand.strokeloss import SandLoss, _by_length
 from jaxsand.strokerivals import RIVALS, random_shooting
@@ -134,6 +136,35 @@ def test_the_bench_writes_what_it_computes_and_does_not_compute_it_again(bar, tm
     assert line["goals"] == 1
     assert line["reached_at_16"] in (0, 1)
     assert len(strokes_figure(rows).axes) == 2
+
+
+def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch):
+    def short(evaluate, n_strokes, bounds, budget, seed):
+        return random_shooting(evaluate, n_strokes, bounds, min(budget, 16), seed)
+
+    monkeypatch.setattr(strokebench, "letters", lambda _: [bar])
+    monkeypatch.setattr(strokebench, "RIVALS", {"random shooting": short})
+    assert main(["bench", "strokes", "--out", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "reached at 4000" in text
+    assert "random shooting bar" in text
+    assert {path.name for path in tmp_path.iterdir()} == {"strokes.jsonl", "bench-strokes.json", "bench-strokes.png"}
+    assert main(["bench", "strokes", "--out", str(tmp_path), "--seed", "1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["strokes"][0]["goals"] == 1
+    assert [row["seed"] for row in report["strokes_curves"]] == [1]
+
+
+def test_goals_of_other_kinds():
+    turned = turned_letters("I", 90)[0]
+    np.testing.assert_allclose(turned.strokes, [[0.265, 0.16, 0.055, 0.16]], atol=1e-9)
+    rough = letters_on_rough_sand("I")[0]
+    assert np.ptp(rough.start) == pytest.approx(0.01, rel=0.2)
+    assert rough.iou(rough.goal) == 1
+    assert rough.iou(rough.start) == 0
+    some = many_strokes(3, 2)
+    assert [goal.strokes.shape for goal in some] == [(3, 4), (3, 4)]
+    assert np.all(np.hypot(*(some[0].strokes[:, 2:] - some[0].strokes[:, :2]).T) >= 0.0625)
 
 
 def test_a_goal_of_another_shape_is_refused(bar):
