@@ -109,7 +109,10 @@ def _trench(commands: Any) -> None:
 def _bench(commands: Any) -> None:
     p = commands.add_parser("bench", help="error against run time, and speed beside plain numpy and plain C")
     p.add_argument(
-        "what", nargs="?", choices=["settle", "push", "plan", "sand", "trench", "all", "stability", "letters"], default="all"
+        "what",
+        nargs="?",
+        choices=["settle", "push", "plan", "sand", "strokes", "trench", "all", "stability", "letters"],
+        default="all",
     )
     p.add_argument("--batch", type=_count, default=4096, help="maps in a batch (4096)")
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")

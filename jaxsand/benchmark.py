@@ -13,13 +13,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import analysis, complexity, expansions, goals, piles, rutbench, sandbench, stability, workprec
+from jaxsand import analysis, complexity, expansions, goals, piles, rutbench, sandbench, stability, strokebench, workprec
 from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
@@ -44,8 +45,10 @@ _NUMPY = "numpy, one map at a time"
 _C = "C loop, one core"
 
 
-def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int = 3, seed: int = 0) -> dict[str, Any]:
-    """The figures for `what`: settle, push, plan, or all of these; sand, trench, stability, or letters.
+def bench(
+    what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int = 3, seed: int = 0, out: Path | None = None
+) -> dict[str, Any]:
+    """The figures for `what`: settle, push, plan, or all of these; sand, strokes, trench, stability, or letters.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
     """
@@ -74,6 +77,8 @@ def bench(what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int 
     if what == "sand":
         report["children"] = sandbench.children_per_second()
         report["sand"] = sandbench.bench_sand(tell, seed=seed)
+    if what == "strokes":
+        report |= strokebench.bench_strokes(tell, seed, out)
     if what == "trench":
         report["trench_by_spacing"] = rutbench.against_spacing(tell, grids + 1)
         report["trench_settles"] = rutbench.settling(tell)
@@ -244,7 +249,7 @@ def table(report: dict[str, Any]) -> str:
     """The report as text."""
     lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
     for what, rows in report.items():
-        if isinstance(rows, list) and rows and what not in ("map", "work_precision"):
+        if isinstance(rows, list) and rows and what not in ("map", "work_precision", "strokes_curves"):
             lines += ["", *as_table(rows, what.replace("_", " "))]
     return "\n".join(lines)
 

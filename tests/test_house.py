@@ -24,11 +24,11 @@ FLOORS = [
     {"roll", "split"},
     {"sim"},
     {"task", "goals", "planner", "plain", "scans"},
-    {"sandplan"},
-    {"shaping", "files", "rut"},
-    {"workprec", "stability", "complexity", "expansions", "sandbench", "rutbench"},
+    {"sandplan", "strokeloss"},
+    {"shaping", "files", "rut", "strokerivals"},
+    {"workprec", "stability", "complexity", "expansions", "sandbench", "rutbench", "strokebench"},
     {"analysis", "piles"},
-    {"render", "rutfigures", "benchmark"},
+    {"render", "rutfigures", "strokefigures", "benchmark"},
     {"commands"},
     {"__main__"},
 ]
@@ -44,7 +44,7 @@ INSIDE = {
     "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],
     "commands": [{"printing"}, {"shape", "settle", "plan", "trench", "bench"}],
 }
-HEAVY = {"matplotlib": {"render", "rutfigures", "goals"}, "PIL": {"render", "goals"}}
+HEAVY = {"matplotlib": {"render", "rutfigures", "strokefigures", "goals"}, "PIL": {"render", "goals"}}
 
 
 def imports(path):

@@ -11,7 +11,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
     out = folder(options.out) if options.out else None
     from jaxsand.benchmark import bench, table
 
-    report = bench(options.what, options.batch, tell, options.grids, options.seed)
+    report = bench(options.what, options.batch, tell, options.grids, options.seed, out)
     if out:
         from jaxsand.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
 
@@ -28,6 +28,11 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
             with written(out / "bench-trench.png") as path:
                 save_figure(spacing_figure(report["trench_by_spacing"]), path)
+        if "strokes_curves" in report:
+            from jaxsand.strokefigures import strokes_figure
+
+            with written(out / "bench-strokes.png") as path:
+                save_figure(strokes_figure(report["strokes_curves"]), path)
         with written(out / f"bench-{options.what}.json") as path:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")

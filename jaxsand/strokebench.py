@@ -1,0 +1,204 @@
+"""Methods that find strokes at equal numbers of simulator calls, on letters and other goals that strokes make."""
+
+import json
+import string
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from jaxsand import goals, task
+from jaxsand.rules import UntilStill
+from jaxsand.scene import Scene, make_scene
+from jaxsand.settling import settle
+from jaxsand.shaping import terrain_surface
+from jaxsand.sim import check, rollout
+from jaxsand.strokeloss import SandLoss
+from jaxsand.strokerivals import RIVALS, Best, Search
+from jaxsand.tool import Blade
+
+Tell = Callable[[str], None]
+Row = dict[str, Any]
+BUDGETS = (1_000, 4_000, 16_000, 64_000)
+REACHED = 0.8
+"""The IoU of dug cells from which a goal counts as reached."""
+
+_CELLS, _SPACING = 32, 0.01
+
+
+@dataclass(frozen=True)
+class StrokeGoal:
+    """What `strokes` [N, 4] (m) leave of `start` [H, W] (m); a search is told the start, the goal and N."""
+
+    name: str
+    scene: Scene
+    start: np.ndarray
+    goal: np.ndarray
+    strokes: np.ndarray
+
+    def iou(self, after: np.ndarray) -> float:
+        """Of what is dug below the start."""
+        tool = self.scene.tool
+        depth = float(tool.depth) if isinstance(tool, Blade) else 0.0
+        return float(task.iou(self.goal - self.start, after - self.start, depth))
+
+
+def stroke_goal(name: str, strokes: np.ndarray, start: np.ndarray | None = None) -> StrokeGoal:
+    """The goal that strokes (m) leave on a map of 32 x 32 cells of 0.01 m at rest (level if None), by the default blade."""
+    scene = make_scene((_CELLS, _CELLS), _SPACING, tool=Blade())
+    start = np.zeros(scene.grid.shape, np.float32) if start is None else np.asarray(start, np.float32)
+    shaped = rollout(scene, start, np.asarray(strokes, np.float32))
+    check(shaped)
+    return StrokeGoal(name, scene, start, np.asarray(shaped.height[-1]), np.asarray(strokes, float))
+
+
+def letters(names: str = string.ascii_uppercase) -> list[StrokeGoal]:
+    """Capital letters on level sand."""
+    return [stroke_goal(name, task.place(goals.letter_strokes(name))) for name in names]
+
+
+def turned_letters(names: str = string.ascii_uppercase, degrees: float = 30.0) -> list[StrokeGoal]:
+    """Letters turned about the middle of the map, counter-clockwise, and made smaller where they would leave it."""
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    out = []
+    for name in names:
+        points = (goals.letter_strokes(name).reshape(-1, 2) - 0.5) @ turn
+        points *= min(1.0, 0.5 / np.abs(points).max())
+        out.append(stroke_goal(f"{name} turned by {degrees:g}", task.place((points + 0.5).reshape(-1, 4))))
+    return out
+
+
+def letters_on_rough_sand(names: str = string.ascii_uppercase, relief: float = 0.01) -> list[StrokeGoal]:
+    """Letters pushed into terrain of a height range `relief` (m)."""
+    scene = make_scene((_CELLS, _CELLS), _SPACING)
+    rested = settle(scene, terrain_surface(scene.grid.shape, relief).astype(np.float32), stop=UntilStill(bound=200_000))
+    check(rested)
+    rough = np.asarray(rested.height)
+    return [stroke_goal(f"{name} on rough sand", task.place(goals.letter_strokes(name)), rough) for name in names]
+
+
+def many_strokes(count: int = 8, goals: int = 5, seed: int = 0) -> list[StrokeGoal]:
+    """Goals of random strokes inside the square of the glyphs, each at least a quarter of it long."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for k in range(goals):
+        drawn = rng.random((64 * count, 4))
+        long = drawn[np.hypot(*(drawn[:, 2:] - drawn[:, :2]).T) >= 0.25][:count]
+        out.append(stroke_goal(f"{count} strokes, {k + 1}", task.place(long)))
+    return out
+
+
+def run_all(
+    methods: dict[str, Search],
+    some: Iterable[StrokeGoal],
+    budgets: tuple[int, ...] = BUDGETS,
+    seeds: tuple[int, ...] = (0,),
+    out: Path | None = None,
+    tell: Tell = lambda _: None,
+) -> list[Row]:
+    """A row for every method, goal and seed: one run at the largest budget, with what it had at each of the others.
+
+    Rows are also written to `out`/strokes.jsonl as they come, and rows that are there already are not computed again.
+    """
+    path = out / "strokes.jsonl" if out else None
+    known = {_key(row): row for row in _read(path)} if path else {}
+    rows = []
+    for goal in some:
+        for seed in seeds:
+            for name, search in methods.items():
+                tell(f"{goal.name}, seed {seed}: {name}")
+                want = {"method": name, "goal": goal.name, "seed": seed, "strokes": len(goal.strokes), "budgets": [*budgets]}
+                row = known.get(_key(want))
+                if row is None:
+                    row = want | run_one(search, goal, budgets, seed)
+                    if path:
+                        with path.open("a", encoding="utf-8") as file:
+                            file.write(json.dumps(row) + "\n")
+                rows.append(row)
+    return rows
+
+
+def run_one(search: Search, goal: StrokeGoal, budgets: tuple[int, ...], seed: int) -> Row:
+    """One search: at each budget its best plan so far, that plan's l2 reduction and IoU; and the curve of all of them."""
+    loss = SandLoss(goal.scene, goal.start, goal.goal)
+    began = time.perf_counter()
+    found = search(loss, len(goal.strokes), loss.bounds, max(budgets), seed)
+    seconds = time.perf_counter() - began
+    before = float(((goal.start.astype(float) - goal.goal) ** 2).sum())
+    marks = [_at(found.history, budget) for budget in budgets]
+    maps = loss.maps(np.stack([found.strokes if mark is None else mark.strokes for mark in marks]))
+    at = [
+        {
+            "budget": budget,
+            "iou": goal.iou(after) if mark else 0.0,
+            "l2_reduction": 1 - (mark.loss / before) ** 0.5 if mark else 0.0,
+            "plan": mark.strokes.tolist() if mark else None,
+        }
+        for budget, mark, after in zip(budgets, marks, maps, strict=True)
+    ]
+    curve = [[best.calls, 1 - (best.loss / before) ** 0.5] for best in found.history]
+    return {"calls": found.calls, "seconds": seconds, "at": at, "curve": curve}
+
+
+def reached(rows: list[Row]) -> list[Row]:
+    """For each method and budget: on how many goals the IoU of dug cells reaches 0.8 (median over seeds), and the medians
+    over goals of the medians over seeds of IoU and l2 reduction."""
+    out = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        names = list(dict.fromkeys(row["goal"] for row in mine))
+        line: Row = {"method": method, "goals": len(names)}
+        for k, budget in enumerate(mine[0]["budgets"]):
+            ends = {
+                figure: [median(row["at"][k][figure] for row in mine if row["goal"] == name) for name in names]
+                for figure in ("iou", "l2_reduction")
+            }
+            line[f"reached_at_{budget}"] = sum(iou >= REACHED for iou in ends["iou"])
+            line[f"iou_at_{budget}"] = median(ends["iou"])
+            line[f"l2_reduction_at_{budget}"] = median(ends["l2_reduction"])
+        out.append(line)
+    return out
+
+
+def bench_strokes(
+    tell: Tell = lambda _: None,
+    seed: int = 0,
+    out: Path | None = None,
+    methods: dict[str, Search] | None = None,
+    budgets: tuple[int, ...] = BUDGETS[:2],
+    names: str = string.ascii_uppercase,
+) -> dict[str, list[Row]]:
+    """Every method on letters on level sand, with one seed."""
+    tell("making the goals")
+    rows = run_all(methods or RIVALS, letters(names), budgets, (seed,), out, tell)
+    return {"strokes": reached(rows), "strokes_by_goal": [_line(row) for row in rows], "strokes_curves": rows}
+
+
+def _line(row: Row) -> Row:
+    return {"method": row["method"], "goal": row["goal"], "strokes": row["strokes"]} | {
+        f"iou_at_{at['budget']}": at["iou"] for at in row["at"]
+    }
+
+
+def _at(history: list[Best], budget: int) -> Best | None:
+    return next((best for best in reversed(history) if best.calls <= budget), None)
+
+
+def _key(row: Row) -> tuple:
+    return row["method"], row["goal"], row["seed"], row["strokes"], tuple(row["budgets"])
+
+
+def _read(path: Path) -> list[Row]:
+    """The rows of a file; a last line that was cut off is left out."""
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return rows

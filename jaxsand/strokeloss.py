@@ -1,0 +1,117 @@
+"""How far plans of strokes end from a goal: many at once, through the simulator, and counted.
+
+A vmapped push takes as long as the longest of its strokes, so strokes are sorted by length and pushed in groups of like
+length, each core taking the next group, longest first. While the blade is down only a window around it is computed; what
+touches the window's edge is pushed again on the whole map. `Whole` and windows give the same maps up to rounding (1e-7 m).
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from jaxsand.batch import cores
+from jaxsand.rules import Outcome
+from jaxsand.scene import Scene
+from jaxsand.sim import step_batch
+from jaxsand.task import fits
+from jaxsand.window import Whole, Window
+
+_SIZES = (8, 16, 32, 64)  # of a group, on a CPU: a few, so that a scene compiles a few programs
+_WINDOW = (16, 16)
+
+
+class Evaluate(Protocol):
+    """What a search may ask. Every stroke of every candidate is one call."""
+
+    @property
+    def start(self) -> np.ndarray:
+        """The map before the first stroke."""
+
+    def __call__(self, candidates: np.ndarray) -> np.ndarray:
+        """The losses [P] of plans [P, N, 4] (m)."""
+
+    def after(self, maps: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The losses [P] and the maps after one more stroke [P, 4] (m) on each of `maps` [P, ...]."""
+
+
+@dataclass(frozen=True)
+class SandLoss:
+    """The squared l2 distance (m^2) from `goal` [H, W] (m) of what strokes leave of `start` [H, W] (m), which is at rest.
+
+    Infinite where the simulator says that its outcome is not clean.
+    """
+
+    scene: Scene
+    start: np.ndarray
+    goal: np.ndarray
+
+    def __post_init__(self) -> None:
+        fits(self.scene, self.start)
+        fits(self.scene, self.goal)
+
+    def __call__(self, candidates: np.ndarray) -> np.ndarray:
+        return self._loss(self.maps(candidates))
+
+    def after(self, maps: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        maps = pushed(self.scene, maps, strokes)
+        return self._loss(maps), maps
+
+    def maps(self, candidates: np.ndarray) -> np.ndarray:
+        """The maps [P, H, W] that plans [P, N, 4] leave; NaN where an outcome is not clean."""
+        maps = np.repeat(self.start[None].astype(np.float32), len(candidates), axis=0)
+        for k in range(candidates.shape[1]):
+            maps = pushed(self.scene, maps, candidates[:, k])
+        return maps
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """The lowest and the highest x0, y0, x1, y1 (m) of strokes from cell centre to cell centre of the map: [2, 4]."""
+        rows, columns = self.scene.grid.shape
+        high = np.array([columns - 1, rows - 1, columns - 1, rows - 1]) * float(self.scene.grid.spacing)
+        return np.stack([np.zeros(4), high])
+
+    def _loss(self, maps: np.ndarray) -> np.ndarray:
+        square = ((maps.astype(float) - self.goal) ** 2).sum((-2, -1))
+        return np.where(np.isnan(square), np.inf, square)
+
+
+def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
+    """What one stroke [P, 4] (m) each leaves of maps [P, H, W] (m) at rest; NaN where the outcome is not clean."""
+    maps, strokes = np.asarray(maps, np.float32), np.asarray(strokes, np.float32)
+    if not isinstance(scene.window, Whole) or any(n < m for n, m in zip(scene.grid.shape, _WINDOW, strict=True)):
+        return _by_length(scene, maps, strokes)[0]
+    after, outcome = _by_length(replace(scene, window=Window(_WINDOW)), maps, strokes)
+    again = np.flatnonzero(outcome & Outcome.WINDOW_EDGE)
+    if again.size:
+        after[again] = _by_length(scene, maps[again], strokes[again])[0]
+    return after
+
+
+def _by_length(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The maps after one stroke each, and their outcomes."""
+    order = np.argsort(np.hypot(*(strokes[:, 2:] - strokes[:, :2]).T), kind="stable")[::-1]
+    size = _size(len(order))
+    groups = [order[i : i + size] for i in range(0, len(order), size)]
+
+    def one(group: np.ndarray) -> tuple[Any, Any]:
+        who = np.concatenate([group, np.repeat(group[-1:], size - len(group))])
+        shaped = step_batch(scene, maps[who], strokes[who], chunk=size)
+        return np.asarray(shaped.height), np.asarray(shaped.outcome)
+
+    after, outcomes = np.empty_like(maps), np.zeros(len(maps), int)
+    with ThreadPoolExecutor(cores()) as pool:
+        for group, (height, outcome) in zip(groups, pool.map(one, groups), strict=True):
+            after[group], outcomes[group] = height[: len(group)], outcome[: len(group)]
+    after[(outcomes & ~Outcome.WINDOW_EDGE) != 0] = np.nan
+    if isinstance(scene.window, Whole):
+        after[outcomes != 0] = np.nan
+    return after, outcomes
+
+
+def _size(count: int) -> int:
+    if jax.default_backend() != "cpu":
+        return 1 << max(0, count - 1).bit_length()
+    return next((size for size in _SIZES if size * cores() >= count), _SIZES[-1])
