@@ -11,7 +11,7 @@ README = Path(__file__).parent.parent / "README.md"
 
 # A file imports only from floors below its own, and never from a neighbour. A folder has a floor, and floors inside.
 FLOORS = [
-    {"grid", "material", "walls", "window", "tool", "loop"},
+    {"grid", "material", "walls", "window", "tool", "loop", "fitting"},
     {"scene"},
     {"bed", "schemes", "forces"},
     {"flux", "rules"},
@@ -22,7 +22,7 @@ FLOORS = [
     {"push", "swath", "trench"},
     {"roll", "split"},
     {"sim"},
-    {"task", "goals", "planner", "plain", "scans"},
+    {"task", "goals", "planner", "plain", "scans", "calibration", "sections"},
     {"sandplan"},
     {"shaping", "files", "rut"},
     {"workprec", "stability", "complexity", "expansions", "sandbench", "rutbench"},
