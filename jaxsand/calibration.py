@@ -103,7 +103,7 @@ def _climbs(
             outcomes.append(outcome)
         return jnp.concatenate(misfits), jnp.all(jnp.concatenate(outcomes) == 0)
 
-    return jax.vmap(lambda x: climb(residuals, x, seen, noise))(begin)
+    return climb(residuals, begin, sum(before.size for before, *_ in groups), seen, noise)
 
 
 def _run(scene: Scene, rules: _Rules, before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -110,13 +110,18 @@ def spread(ranges: list[Range], starts: int) -> np.ndarray:
 
 
 def climb(
-    residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]], start: jax.Array, seen: jax.Array, noise: jax.Array
+    residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    starts: jax.Array,
+    size: int,
+    seen: jax.Array,
+    noise: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
-    """From one start [P], in units of the ranges: where it ends; the cost, the Jacobian and whether the model was clean
-    there; whether it has converged, and after how many looks. To be vmapped over starts.
+    """From each start [S, P], in units of the ranges: where it ends; the cost, the Jacobian and whether the model was clean
+    there; whether it has converged, and after how many looks.
 
-    `residuals` gives r and whether the model was clean. It has converged where a step promises less than 1e-4 sigma^2, or,
-    at a kink, where steps gain nothing however short. `noise` NaN: sigma is the residual's own.
+    `residuals` of one x gives r [size], of which `seen` count, and whether the model was clean. A climb has converged where
+    a step promises less than 1e-4 sigma^2, or, at a kink, where steps gain nothing however short. `noise` NaN: sigma is the
+    residual's own.
     """
 
     def look(x: jax.Array) -> Any:
@@ -128,7 +133,7 @@ def climb(
         return x, r, jacobian, clean
 
     def advance(state: Any) -> Any:
-        trial, kept, damping, _, count = state
+        trial, kept, damping, ready, count = state
         new = look(trial)
         # The sum is exact where the difference of the costs would be rounded off.
         better = (count == 0) | (jnp.sum((kept[1] - new[1]) * (kept[1] + new[1])) > 0)
@@ -138,22 +143,25 @@ def climb(
         held = ((x <= 0) & (slope > 0)) | ((x >= 1) & (slope < 0))
         slope = jnp.where(held, 0, slope)
         curve = jnp.where(held[:, None] | held[None, :], 0, curve)
-        size = jnp.diag(curve)
-        floor = jnp.maximum(1e-6 * jnp.max(size), jnp.finfo(x.dtype).tiny)
-        step = -jnp.linalg.solve(curve + jnp.diag(damping * size + floor), slope)
+        scale = jnp.diag(curve)
+        floor = jnp.maximum(1e-6 * jnp.max(scale), jnp.finfo(x.dtype).tiny)
+        step = -jnp.linalg.solve(curve + jnp.diag(damping * scale + floor), slope)
         trial = jnp.clip(x + step, 0, 1)
         sigma2 = jnp.where(jnp.isnan(noise), jnp.sum(r * r) / (seen - x.size), noise**2)
         near = (-jnp.sum(slope * step) < _NEAR * sigma2) & (damping < 1)
         done = near | (jnp.max(jnp.abs(trial - x)) < _FINE)
-        return trial, (x, r, jacobian, clean), damping, done, count + 1
+        after = trial, (x, r, jacobian, clean), damping, done, count + 1
+        return jax.tree.map(lambda a, b: jnp.where(ready, a, b), state, after)
 
     def goes_on(state: Any) -> jax.Array:
-        return ~state[3] & (state[4] < _LOOKS)
+        return jnp.any(~state[3] & (state[4] < _LOOKS))
 
-    nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(look, start))
-    begin = (start, nothing, jnp.asarray(0.1, start.dtype), jnp.zeros((), bool), jnp.zeros((), jnp.int32))
-    _, (x, r, jacobian, clean), _, done, count = lax.while_loop(goes_on, advance, begin)
-    return x, jnp.sum(r * r), jacobian, clean, done, count
+    many, free = starts.shape
+    r, jacobian = jnp.zeros((many, size), starts.dtype), jnp.zeros((many, size, free), starts.dtype)
+    no = jnp.zeros(many, bool)
+    begin = (starts, (starts, r, jacobian, no), jnp.full(many, 0.1, starts.dtype), no, jnp.zeros(many, jnp.int32))
+    _, (x, r, jacobian, clean), _, done, count = lax.while_loop(goes_on, jax.vmap(advance), begin)
+    return x, jnp.sum(r * r, axis=1), jacobian, clean, done, count
 
 
 def conclude(

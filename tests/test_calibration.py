@@ -49,38 +49,33 @@ def test_one_noisy_collapse_tells_the_angle_and_how_well():
     assert abs(np.mean(pulls)) < 0.65  # three of its standard deviations
 
 
-def test_a_push_tells_the_angle_and_the_blade():
+@pytest.mark.parametrize("push", [js.SwathPush(), pytest.param(js.SteppedPush(), marks=pytest.mark.slow)])
+def test_a_push_tells_the_angle_and_the_blade(push):
     """To rounding without noise, from lengths off by half; within four standard errors with it."""
-    pushed = np.asarray(js.step(sand(31, js.Blade()), LEVEL, STROKE).height)
+    pushed = np.asarray(js.step(sand(31, js.Blade()), LEVEL, STROKE, push=push).height)
     guess = sand(16, js.Blade(0.03, 0.015, 0.00375))
-    found = js.calibrate(guess, js.Trial(LEVEL, pushed, STROKE))
+    found = js.calibrate(guess, js.Trial(LEVEL, pushed, STROKE), push=push)
     assert found.verdict == 0
     assert abs(off(found, 31)) < 0.01
     assert found.values["width"] == pytest.approx(0.02, rel=1e-4)
     assert found.model.tool.depth == pytest.approx(0.0075, rel=1e-4)
-    noisy = js.calibrate(guess, js.Trial(LEVEL, pushed + noise(1), STROKE))
+    noisy = js.calibrate(guess, js.Trial(LEVEL, pushed + noise(1), STROKE), push=push)
     assert noisy.verdict == 0
     true = (math.radians(31), 0.02, 0.0075)
     for value, error, known in zip(noisy.values.values(), noisy.errors.values(), true, strict=True):
         assert abs(value - known) < 4 * error
-    # A single default stroke moves too little sand for 0.2 degrees: the bound itself is half a degree.
+    # A single default stroke moves too little sand for 0.2 degrees: the bound itself is about half a degree.
     assert 0.3 < math.degrees(noisy.errors["repose_angle"]) < 0.8
 
 
 def test_the_errors_are_the_cramer_rao_bound():
-    """sigma over the length of the derivative; here with a gap, and of the same data twice."""
+    """sigma over the length of the derivative, of the cells that were seen."""
     after = collapsed(29).copy()
     after[:, 20:] = np.nan
     found = js.calibrate(sand(25), js.Trial(PILLAR, after), free=ANGLE, noise=NOISE)
-    with jax.enable_x64(True):
-        up, down = (
-            np.asarray(js.settle(sand(29 + d), PILLAR.astype(float), stop=js.UntilStill(1e-6)).height) for d in (0.1, -0.1)
-        )
-    slope = (up - down)[:, :20] / math.radians(0.2)
+    slope = (collapsed(29.25) - collapsed(28.75))[:, :20] / math.radians(0.5)
     assert found.errors["repose_angle"] == pytest.approx(NOISE / np.linalg.norm(slope), rel=0.02)
     assert abs(off(found, 29)) < 0.01
-    twice = js.calibrate(sand(25), [js.Trial(PILLAR, after)] * 2, free=ANGLE, noise=NOISE)
-    assert twice.errors["repose_angle"] == pytest.approx(found.errors["repose_angle"] / math.sqrt(2), rel=1e-3)
 
 
 def test_regions_have_angles_of_their_own_and_level_sand_tells_none():
@@ -117,15 +112,12 @@ def test_a_wrong_model_is_said():
     found = js.calibrate(sand(25), js.Trial(PILLAR, collapsed(29) + noise(5)), free=narrow)
     assert js.Verdict.AT_LIMIT in found.verdict
     assert math.degrees(found.values["repose_angle"]) == pytest.approx(25, abs=1e-3)
-    short = js.calibrate(sand(25), js.Trial(PILLAR, collapsed(29)), free=ANGLE, stop=js.UntilStill(bound=8))
-    assert js.Verdict.UNCLEAN in short.verdict
 
 
-def fitted(residuals, ranges, starts=6, count=50, sigma=None):
+def fitted(residuals, ranges, starts=6, count=50, sigma=None, clean=True):
     """The climb and its conclusion on residuals of x in units of the ranges."""
-    begin = jnp.asarray(spread(ranges, starts))
-    given = jnp.asarray(math.nan if sigma is None else sigma)
-    found = jax.jit(jax.vmap(lambda x: climb(lambda x: (residuals(x), jnp.ones((), bool)), x, jnp.asarray(count), given)))(
+    begin, given = jnp.asarray(spread(ranges, starts)), jnp.asarray(math.nan if sigma is None else sigma)
+    found = jax.jit(lambda x: climb(lambda x: (residuals(x), jnp.asarray(clean)), x, count, jnp.asarray(count), given))(
         begin
     )
     *ends, looks = (np.asarray(part) for part in found)
@@ -150,6 +142,7 @@ def test_mixtures_and_rivals_are_said():
     assert fitted(lambda x: x[0] + x[1] - 1 + error, two).untold == ("a", "b")
     rivals = fitted(lambda x: 4 * (x[0] - 0.2) * (x[0] - 0.8) + error, two[:1])
     assert rivals.verdict == js.Verdict.AMBIGUOUS
+    assert fitted(lambda x: x[0] - 0.5 + error, two[:1], clean=False).verdict == js.Verdict.UNCLEAN
 
 
 def section(run, profile, seed, guess):
