@@ -38,7 +38,7 @@ class Verdict(IntFlag):
     POOR_FIT = 16
     """The residual is larger than the given noise explains, by five standard deviations: doubt the model, or the noise."""
     UNCLEAN = 32
-    """The simulator's outcome is not clean at the estimate; see `jaxsand.check`."""
+    """The simulator's outcome is not clean at the estimate (see `jaxsand.check`), or a section's model ends next to it."""
 
 
 @dataclass(frozen=True)
