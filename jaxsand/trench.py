@@ -16,6 +16,7 @@ Heights and places are in metres, x to the right across the way, 0 at the middle
 
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -230,11 +231,25 @@ def relaxed(runs: list[Pass], spacing: float = 5e-4) -> list[Profile]:
     if len({run.repose_angle for run in runs}) != 1:
         angles = sorted({run.repose_angle for run in runs})
         raise ValueError(f"runs: got repose angles {angles}; give at least one run, all of one angle")
-    sections = [unsettled(run) for run in runs]
-    reach = max(abs(end) for section in sections for end in section.toes) * 1.1 + 10 * spacing
+    reach = max(abs(end) for run in runs for end in unsettled(run).toes) * 1.1 + 10 * spacing
+    return _relaxed(runs, reach, spacing)
+
+
+def relaxing(reach: float = 0.2, spacing: float = 1e-3) -> Callable[[Pass], Profile]:
+    """`relaxed` for one pass after the other, on cells of `spacing` (m) as far as `reach` (m) to either side."""
+
+    def relax(run: Pass) -> Profile:
+        if max(map(abs, unsettled(run).toes)) > reach - 10 * spacing:
+            raise ValueError(f"reach: got {reach!r} m, too little for a sinkage of {run.sinkage * 1e3:.4g} mm; give more")
+        return _relaxed([run], reach, spacing)[0]
+
+    return relax
+
+
+def _relaxed(runs: list[Pass], reach: float, spacing: float) -> list[Profile]:
     half = math.ceil(reach / spacing)
     edges = (np.arange(-half, half + 2) - 0.5) * spacing
-    start = np.stack([cell_means(section, edges) for section in sections])[:, None, :]
+    start = np.stack([cell_means(unsettled(run), edges) for run in runs])[:, None, :]
     with jax.enable_x64(True):
         scene = make_scene((1, 2 * half + 1), spacing, runs[0].repose_angle, 4)
         stop = UntilStill(1e-6, bound=2_000_000)

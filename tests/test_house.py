@@ -11,7 +11,7 @@ README = Path(__file__).parent.parent / "README.md"
 
 # A file imports only from floors below its own, and never from a neighbour. A folder has a floor, and floors inside.
 FLOORS = [
-    {"grid", "material", "walls", "window", "tool", "lockstep"},
+    {"grid", "material", "walls", "window", "tool", "lockstep", "fitting"},
     {"scene", "loop"},
     {"bed", "schemes", "forces"},
     {"flux", "rules", "adjoint"},
@@ -23,7 +23,7 @@ FLOORS = [
     {"push", "swath", "trench"},
     {"roll", "split"},
     {"sim"},
-    {"task", "goals", "planner", "plain", "scans"},
+    {"task", "goals", "planner", "plain", "scans", "calibration", "sections"},
     {"sandplan", "strokeloss"},
     {"shaping", "files", "rut", "strokerivals"},
     {"workprec", "stability", "complexity", "expansions", "sandbench", "rutbench", "strokebench"},

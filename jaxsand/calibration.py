@@ -1,0 +1,207 @@
+"""Parameters of sand and tool from height maps before and after a push or a collapse; see fitting.py for the method."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
+from jaxsand.material import Material
+from jaxsand.rules import Stop, check_rule, check_whole
+from jaxsand.scene import Scene, as_array, concrete, fit
+from jaxsand.schemes import Scheme
+from jaxsand.settling import settle
+from jaxsand.sim import Push, rollout
+from jaxsand.tool import NoTool
+
+Free = Sequence[str] | Mapping[str, tuple[float, float]]
+_REPOSE = "repose_angle"
+_ANGLES = (math.radians(10), math.radians(50))
+_Rules = tuple[Push | None, Scheme | None, Stop | None]
+_Group = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # before, after, seen [k, H, W]; strokes [k, n, 4]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A height map [H, W] (m) `before`, one `after`, and the `stroke` between them: none (the sand settles), [4], or [n, 4]
+    for pushes one after the other, each x0, y0, x1, y1 (m). NaN in `after` was not seen; `before` is taken as it is."""
+
+    before: Any
+    after: Any
+    stroke: Any = None
+
+
+def calibrate(
+    scene: Scene,
+    trials: Trial | Sequence[Trial],
+    *,
+    free: Free = (_REPOSE, "width", "depth"),
+    regions: Any = None,
+    noise: float | None = None,
+    starts: int = 6,
+    push: Push | None = None,
+    scheme: Scheme | None = None,
+    stop: Stop | None = None,
+) -> Calibration[Scene]:
+    """The parameters with which the simulator best explains what was seen, in least squares over all cells of all trials.
+
+    Args:
+      scene: what is known, and the guess of what is free, from which the first start sets out.
+      trials: one or several, which share the parameters.
+      free: "repose_angle" and fields of the tool; or these with their ranges (low, high), which are not left. By default 10
+        to 50 degrees for the angle of repose, and a third to three times the guess for others.
+      regions: labels [H, W] from 0 to R - 1, for an angle of repose each: repose_angle[0], repose_angle[1], ...
+      noise: sigma (m) of the white noise in `after`; by default it is estimated from the residual.
+      starts: how many; those after the first are spread over the ranges.
+      push, scheme, stop: as in `jaxsand.step`.
+
+    The standard errors are those of white noise in `after`. Errors of the model are not in them: its spacing, its rule of
+    pushing, noise in `before`. Computes in the dtype of the maps; float32 will do. To learn what an experiment could tell
+    before it is made, give its own simulated `after`, and the noise: the errors are then the Cramer-Rao bound.
+
+    Raises:
+      ValueError: names the field, the value and the remedy. Data that do not tell a parameter, or that no parameters
+        explain, raise nothing: the `verdict` says so.
+    """
+    some = [trials] if isinstance(trials, Trial) else list(trials)
+    check_whole("starts", starts, 1)
+    check_noise(noise)
+    check_rule(scene, scheme, stop)
+    groups, seen = _grouped(scene, some)
+    labels = _labels(scene, regions)
+    ranges, names = _ranges(scene, free, 0 if labels is None else int(labels.max()) + 1)
+    if seen <= len(ranges):
+        raise ValueError(f"trials: got {seen} seen cells for {len(ranges)} free parameters; give more, or free fewer")
+    dtype = groups[0][0].dtype
+    box = jnp.asarray([[r.low for r in ranges], [r.high for r in ranges]], dtype)
+    begin, sigma = jnp.asarray(spread(ranges, starts), dtype), jnp.asarray(math.nan if noise is None else noise, dtype)
+    rules = (push, scheme, stop)
+    found = _climbs(scene, rules, labels, groups, box, begin, jnp.asarray(seen, dtype), sigma, names)
+    ends, costs, jacobians, clean, done, count = (np.asarray(part) for part in found)
+
+    def model(values: np.ndarray) -> Scene:
+        return _with(scene, names, labels, jnp.asarray(values, dtype))
+
+    return conclude(ranges, ends, costs, jacobians, clean, done, seen, noise, int(count.sum()) * len(some), model)
+
+
+@partial(jax.jit, static_argnames="names")
+def _climbs(
+    scene: Scene, rules: _Rules, labels: Any, groups: list[_Group], box: Any, begin: Any, seen: Any, noise: Any, names: Any
+) -> Any:
+    def residuals(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        there = _with(scene, names, labels, box[0] + x * (box[1] - box[0]))
+        misfits, outcomes = [], []
+        for before, after, sees, strokes in groups:
+            height, outcome = _run(there, rules, before, strokes)
+            misfits.append(jnp.where(sees, height - after, 0).ravel())
+            outcomes.append(outcome)
+        return jnp.concatenate(misfits), jnp.all(jnp.concatenate(outcomes) == 0)
+
+    return climb(residuals, begin, sum(before.size for before, *_ in groups), seen, noise)
+
+
+def _run(scene: Scene, rules: _Rules, before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What the maps [k, H, W] become, and the outcomes."""
+    push, scheme, stop = rules
+
+    def one(before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:
+        if not strokes.shape[0]:
+            settled = settle(scene, before, scheme=scheme, stop=stop)
+            return settled.height, settled.outcome
+        shaped = rollout(scene, before, strokes, push=push, scheme=scheme, stop=stop)
+        return shaped.height[-1], jnp.max(shaped.outcome)
+
+    return jax.vmap(one)(before, strokes)
+
+
+def _with(scene: Scene, names: tuple[str, ...], labels: Any, values: jax.Array) -> Scene:
+    """The scene with these values of what is free: angles of repose first, if any."""
+    fields_of_tool = [name for name in names if name != _REPOSE]
+    angles = values[: values.size - len(fields_of_tool)]
+    if angles.size:
+        scene = replace(scene, material=Material(angles[0] if labels is None else angles[labels]))
+    if fields_of_tool:
+        tool: Any = scene.tool
+        scene = replace(scene, tool=replace(tool, **dict(zip(fields_of_tool, values[angles.size :], strict=True))))
+    return scene
+
+
+def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
+    """Trials of as many strokes, stacked; and the number of cells seen."""
+    if not trials:
+        raise ValueError("trials: got none; give at least one Trial(before, after, stroke)")
+    groups: dict[int, list[Any]] = {}
+    dtype = jnp.result_type(*(as_array("before", trial.before) for trial in trials))
+    for trial in trials:
+        before = fit(scene, as_array("before", trial.before, dtype))[1]
+        after = as_array("after", trial.after, dtype)
+        strokes = jnp.zeros((0, 4), dtype) if trial.stroke is None else as_array("stroke", trial.stroke, dtype)
+        if strokes.shape != (4,) and (strokes.ndim != 2 or strokes.shape[1] != 4):
+            raise ValueError(f"stroke: got shape {list(strokes.shape)}; give x0, y0, x1, y1, rows of these, or None")
+        if strokes.size and isinstance(scene.tool, NoTool):
+            raise ValueError("stroke: got one, but the scene has no tool; give the scene a Blade or a Wheel")
+        for name, value in (("before", before), ("stroke", strokes)):
+            if bad := int(np.sum(~np.isfinite(value))):
+                raise ValueError(f"{name}: got {bad} numbers that are not finite; fill them (only `after` may have gaps)")
+        if after.shape != before.shape:
+            raise ValueError(f"after: got shape {list(after.shape)}; give one like before's, {list(before.shape)}")
+        seen = jnp.isfinite(after)
+        strokes = strokes.reshape(-1, 4)
+        groups.setdefault(strokes.shape[0], []).append((before, jnp.where(seen, after, 0), seen, strokes))
+    stacked: Any = [tuple(jnp.stack(part) for part in zip(*some, strict=True)) for some in groups.values()]
+    return stacked, sum(int(group[2].sum()) for group in stacked)
+
+
+def _labels(scene: Scene, regions: Any) -> np.ndarray | None:
+    if regions is None:
+        return None
+    labels = np.asarray(regions)
+    if labels.dtype.kind not in "iu" or labels.shape != scene.grid.shape:
+        got = f"{labels.dtype} of shape {list(labels.shape)}"
+        raise ValueError(f"regions: got {got}; give whole numbers of shape {list(scene.grid.shape)}")
+    if set(np.unique(labels).tolist()) != set(range(int(labels.max()) + 1)):
+        raise ValueError(f"regions: got labels {np.unique(labels).tolist()}; number the regions 0, 1, ... without gaps")
+    return labels.astype(np.int32)
+
+
+def _ranges(scene: Scene, free: Free, regions: int) -> tuple[list[Range], tuple[str, ...]]:
+    """A range for every parameter, and the names that are free, the angle of repose first."""
+    asked = as_ranges(free)
+    values = {field.name: concrete(getattr(scene.tool, field.name)) for field in fields(scene.tool)}
+    tool = {name: float(value) for name, value in values.items() if value is not None and np.isfinite(value).all()}
+    unknown = set(asked) - {_REPOSE, *tool}
+    if unknown:
+        raise ValueError(f"free: got {sorted(unknown)}; choose from {[_REPOSE, *tool]}")
+    if regions and _REPOSE not in asked:
+        raise ValueError("regions: got labels, but the angle of repose is not free; name it in free, or leave regions out")
+    names = tuple(sorted(asked, key=lambda name: name != _REPOSE))
+    ranges = []
+    for name in names:
+        if name == _REPOSE:
+            guess = float(np.mean(np.asarray(scene.material.repose_angle)))
+            low, high = asked[name] or _ANGLES
+            if not 0 < low < high < math.pi / 2:
+                raise ValueError(f"free: got {low!r} to {high!r} for repose_angle; give rad above 0 and below pi/2")
+            many = [f"{name}[{k}]" for k in range(regions)] or [name]
+            ranges += [Range(one, low, high, guess) for one in many]
+        else:
+            ranges.append(_range_of_tool(scene, name, tool[name], asked[name]))
+    return ranges, names
+
+
+def _range_of_tool(scene: Scene, name: str, guess: float, ends: tuple[float, float] | None) -> Range:
+    least = float(scene.grid.spacing) if name in ("width", "thickness", "radius") else -math.inf
+    most = {"slip_angle": math.pi / 2, "sinkage": float(getattr(scene.tool, "radius", math.inf))}.get(name, math.inf)
+    if ends is None:
+        if not guess > 0:
+            raise ValueError(f"free: got a guess of {guess!r} for {name}; give its range, as in {{{name!r}: (low, high)}}")
+        ends = max(guess / 3, least), min(3 * guess, most)
+    if not least * (1 - 1e-6) <= ends[0] < ends[1] <= most:
+        raise ValueError(f"free: got {ends[0]!r} to {ends[1]!r} for {name}; give (low, high) from {least:g} to {most:g}")
+    return Range(name, *ends, guess)

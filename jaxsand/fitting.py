@@ -1,0 +1,214 @@
+"""Least squares with error bars: the climb, and what is to be said of where it ends.
+
+The cost sum r(x)^2 of residuals r (m) is brought down by Gauss-Newton steps (J^T J + damping D) dx = -J^T r, D the diagonal
+of J^T J (Levenberg 1944, Marquardt 1963, doi:10.1137/0111030). Parameters are measured in their ranges, x from 0 to 1, and
+stay there. The covariance is sigma^2 (J^T J)^-1, that of white noise sigma to first order, which is also the Cramer-Rao
+bound.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Any, Generic, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+Model = TypeVar("Model")
+_LOOKS = 40
+_NEAR = 1e-4  # of sigma^2: what a step that is not worth taking promises, 0.01 standard errors
+_FINE = 1e-5  # of a range: a step that is none
+_IDLE = 12.0  # 1 / variance of a parameter of which no more is known than its range
+
+
+class Verdict(IntFlag):
+    """What a calibration has to say for itself; 0 is a clean one."""
+
+    NOT_CONVERGED = 1
+    """The best start was still moving after the last step."""
+    NOT_TOLD = 2
+    """The data tell some parameter, or some mixture of several, no better than its range does: see `untold`."""
+    AT_LIMIT = 4
+    """An estimate lies at an end of its range: widen the range, or doubt the model."""
+    AMBIGUOUS = 8
+    """Another start fits as well, within two standard deviations, more than five standard errors away."""
+    POOR_FIT = 16
+    """The residual is larger than the given noise explains, by five standard deviations: doubt the model, or the noise."""
+    UNCLEAN = 32
+    """The simulator's outcome is not clean at the estimate (see `jaxsand.check`), or a section's model ends next to it."""
+
+
+@dataclass(frozen=True)
+class Calibration(Generic[Model]):
+    """What was found: `values` and standard `errors` by name, in SI units and rad, and their `covariance` in that order.
+
+    `untold` parameters have infinite errors. `residual` is the rms misfit (m), `noise` the sigma (m) on which the errors
+    rest, `calls` how often the model was run, `model` the model with the values put in.
+    """
+
+    values: dict[str, float]
+    errors: dict[str, float]
+    covariance: np.ndarray
+    untold: tuple[str, ...]
+    residual: float
+    noise: float
+    calls: int
+    verdict: Verdict
+    model: Model
+
+    @property
+    def converged(self) -> bool:
+        return Verdict.NOT_CONVERGED not in self.verdict
+
+
+@dataclass(frozen=True)
+class Range:
+    """A free parameter: its name, the ends of its range, and the guess from which the first start sets out."""
+
+    name: str
+    low: float
+    high: float
+    guess: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise ValueError(f"free: got {self.low!r} to {self.high!r} for {self.name}; give a finite (low, high)")
+
+
+def as_ranges(free: Any) -> dict[str, tuple[float, float] | None]:
+    """The names that are free, each with its range if one is given."""
+    ranges = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
+    if not ranges:
+        raise ValueError("free: got no names; free at least one parameter")
+    for name, ends in ranges.items():
+        if ends is not None and np.shape(ends) != (2,):
+            raise ValueError(f"free: got {ends!r} for {name}; give (low, high)")
+    return ranges
+
+
+def check_noise(noise: float | None) -> None:
+    """Raises ValueError unless the noise is None or a positive number."""
+    if noise is not None and not 0 < noise < math.inf:
+        raise ValueError(f"noise: got {noise!r}; give its sigma in metres, such as 6e-4, or None to estimate it")
+
+
+def spread(ranges: list[Range], starts: int) -> np.ndarray:
+    """Starts [starts, P] in units of the ranges: the guess, and points that fill the middle three quarters evenly.
+
+    Source: the additive recurrence of Roberts (2018), with the powers of the root of g^(P + 1) = g + 1.
+    """
+    g = 2.0
+    for _ in range(50):
+        g = (1 + g) ** (1 / (len(ranges) + 1))
+    steps = g ** -np.arange(1.0, len(ranges) + 1)
+    even = (0.5 + steps * np.arange(1, starts)[:, None]) % 1
+    first = np.clip([[(r.guess - r.low) / (r.high - r.low) for r in ranges]], 0, 1)
+    return np.concatenate([first, 0.125 + 0.75 * even])
+
+
+def climb(
+    residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    starts: jax.Array,
+    size: int,
+    seen: jax.Array,
+    noise: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
+    """From each start [S, P], in units of the ranges: where it ends; the cost, the Jacobian and whether the model was clean
+    there; whether it has converged, and after how many looks.
+
+    `residuals` of one x gives r [size], of which `seen` count, and whether the model was clean. A climb has converged where
+    a step promises less than 1e-4 sigma^2, or, at a kink, where steps gain nothing however short. `noise` NaN: sigma is the
+    residual's own.
+    """
+
+    def look(x: jax.Array) -> Any:
+        def twice(x: jax.Array) -> Any:
+            r, clean = residuals(x)
+            return r, (r, clean)
+
+        jacobian, (r, clean) = jax.jacfwd(twice, has_aux=True)(x)
+        return x, r, jacobian, clean
+
+    def advance(state: Any) -> Any:
+        trial, kept, damping, ready, count = state
+        new = look(trial)
+        # The sum is exact where the difference of the costs would be rounded off.
+        better = (count == 0) | (jnp.sum((kept[1] - new[1]) * (kept[1] + new[1])) > 0)
+        x, r, jacobian, clean = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, kept)
+        damping = jnp.clip(jnp.where(better, damping / 8, damping * 8), 1e-5, 1e8)
+        slope, curve = jacobian.T @ r, jacobian.T @ jacobian
+        held = ((x <= 0) & (slope > 0)) | ((x >= 1) & (slope < 0))
+        slope = jnp.where(held, 0, slope)
+        curve = jnp.where(held[:, None] | held[None, :], 0, curve)
+        scale = jnp.diag(curve)
+        floor = jnp.maximum(1e-6 * jnp.max(scale), jnp.finfo(x.dtype).tiny)
+        step = -jnp.linalg.solve(curve + jnp.diag(damping * scale + floor), slope)
+        trial = jnp.clip(x + step, 0, 1)
+        sigma2 = jnp.where(jnp.isnan(noise), jnp.sum(r * r) / (seen - x.size), noise**2)
+        near = (-jnp.sum(slope * step) < _NEAR * sigma2) & (damping < 1)
+        done = near | (jnp.max(jnp.abs(trial - x)) < _FINE)
+        after = trial, (x, r, jacobian, clean), damping, done, count + 1
+        return jax.tree.map(lambda a, b: jnp.where(ready, a, b), state, after)
+
+    def goes_on(state: Any) -> jax.Array:
+        return jnp.any(~state[3] & (state[4] < _LOOKS))
+
+    many, free = starts.shape
+    r, jacobian = jnp.zeros((many, size), starts.dtype), jnp.zeros((many, size, free), starts.dtype)
+    no = jnp.zeros(many, bool)
+    begin = (starts, (starts, r, jacobian, no), jnp.full(many, 0.1, starts.dtype), no, jnp.zeros(many, jnp.int32))
+    _, (x, r, jacobian, clean), _, done, count = lax.while_loop(goes_on, jax.vmap(advance), begin)
+    return x, jnp.sum(r * r, axis=1), jacobian, clean, done, count
+
+
+def conclude(
+    ranges: list[Range],
+    ends: np.ndarray,
+    costs: np.ndarray,
+    jacobians: np.ndarray,
+    clean: np.ndarray,
+    done: np.ndarray,
+    seen: int,
+    noise: float | None,
+    calls: int,
+    model: Callable[[np.ndarray], Model],
+) -> Calibration[Model]:
+    """The best of several climbs, and what is to be said of it; `model` makes one of values."""
+    costs = np.nan_to_num(costs.astype(float), nan=1e30, posinf=1e30)
+    best = int(np.argmin(costs))
+    x, cost, jacobian = ends[best].astype(float), float(costs[best]), np.nan_to_num(jacobians[best].astype(float))
+    names, low, high = [r.name for r in ranges], np.array([r.low for r in ranges]), np.array([r.high for r in ranges])
+    spare = seen - len(ranges)
+    sigma = math.sqrt(cost / spare) if noise is None else noise
+    verdict = Verdict(0) if done[best] else Verdict.NOT_CONVERGED
+    information = jacobian.T @ jacobian / max(sigma**2, 1e-30)
+    curves, ways = np.linalg.eigh(information)
+    told = curves > max(_IDLE, 1e-7 * curves[-1])
+    covariance = (ways[:, told] / curves[told]) @ ways[:, told].T * np.outer(high - low, high - low)
+    hidden = np.any(ways[:, ~told] ** 2 > 0.01, axis=1)
+    covariance[hidden, :] = covariance[:, hidden] = np.nan
+    covariance[hidden, hidden] = np.inf
+    if hidden.any():
+        verdict |= Verdict.NOT_TOLD
+    if np.any((np.abs(x - 0.5) > 0.499) & ~hidden):
+        verdict |= Verdict.AT_LIMIT
+    apart = np.sum(((ends - x) @ (ways[:, told] * np.sqrt(curves[told]))) ** 2, axis=1)
+    if np.any(done & (costs - cost < 4 * sigma**2) & (apart > 25)):
+        verdict |= Verdict.AMBIGUOUS
+    if noise is not None and cost / noise**2 > spare + 5 * math.sqrt(2 * spare):
+        verdict |= Verdict.POOR_FIT
+    values = low + x * (high - low)
+    return Calibration(
+        dict(zip(names, values.tolist(), strict=True)),
+        dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        covariance,
+        tuple(name for name, yes in zip(names, hidden, strict=True) if yes),
+        math.sqrt(cost / seen),
+        sigma,
+        calls,
+        verdict if clean[best] else verdict | Verdict.UNCLEAN,
+        model(values),
+    )
