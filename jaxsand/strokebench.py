@@ -12,22 +12,51 @@ from typing import Any
 import numpy as np
 
 from jaxsand import goals, task
+from jaxsand.optimise import first, print_of, search
+from jaxsand.optimise.account import Account
+from jaxsand.optimise.moves import reordered
 from jaxsand.rules import UntilStill
 from jaxsand.scene import Scene, make_scene
 from jaxsand.settling import settle
 from jaxsand.shaping import terrain_surface
 from jaxsand.sim import check, rollout
-from jaxsand.strokeloss import SandLoss
-from jaxsand.strokerivals import RIVALS, Best, Search
+from jaxsand.strokeloss import Best, SandLoss
+from jaxsand.strokerivals import RIVALS, Found
 from jaxsand.tool import Blade
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]
+Method = Callable[[SandLoss, int, np.ndarray, int, int], Found]
 BUDGETS = (1_000, 4_000, 16_000, 64_000)
 REACHED = 0.8
 """The IoU of dug cells from which a goal counts as reached."""
 
 _CELLS, _SPACING = 32, 0.01
+
+
+def by_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+    """What `optimise_strokes` does."""
+    account = Account(sand, budget)
+    search(account, n_strokes, np.random.default_rng(seed))
+    return Found(account.best.strokes, account.calls, account.history)
+
+
+def without_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+    """From the same first guesses, orders and directions, by mutations that grow when they help and shrink when not."""
+    account, rng = Account(sand, budget), np.random.default_rng(seed)
+    plans = first(account, print_of(account), n_strokes, rng)
+    if plans is not None:
+        plan = reordered(account, plans)[0][0]
+        width = 2e-3
+        while account.room(n_strokes):
+            last = account.best.loss
+            account.losses(np.clip(plan + rng.normal(0, width, (16, *plan.shape)), *bounds))
+            plan = account.best.strokes
+            width = min(max(width * (1.3 if account.best.loss < last else 0.8), 1e-5), 2e-2)
+    return Found(account.best.strokes, account.calls, account.history)
+
+
+METHODS: dict[str, Method] = {"gradients": by_gradients, "sketch and mutations": without_gradients, **RIVALS}
 
 
 @dataclass(frozen=True)
@@ -94,7 +123,7 @@ def many_strokes(count: int = 8, goals: int = 5, seed: int = 0) -> list[StrokeGo
 
 
 def run_all(
-    methods: dict[str, Search],
+    methods: dict[str, Method],
     some: Iterable[StrokeGoal],
     budgets: tuple[int, ...] = BUDGETS,
     seeds: tuple[int, ...] = (0,),
@@ -110,12 +139,12 @@ def run_all(
     rows = []
     for goal in some:
         for seed in seeds:
-            for name, search in methods.items():
+            for name, method in methods.items():
                 tell(f"{goal.name}, seed {seed}: {name}")
                 want = {"method": name, "goal": goal.name, "seed": seed, "strokes": len(goal.strokes), "budgets": [*budgets]}
                 row = known.get(_key(want))
                 if row is None:
-                    row = want | run_one(search, goal, budgets, seed)
+                    row = want | run_one(method, goal, budgets, seed)
                     if path:
                         with path.open("a", encoding="utf-8") as file:
                             file.write(json.dumps(row) + "\n")
@@ -123,11 +152,11 @@ def run_all(
     return rows
 
 
-def run_one(search: Search, goal: StrokeGoal, budgets: tuple[int, ...], seed: int) -> Row:
+def run_one(method: Method, goal: StrokeGoal, budgets: tuple[int, ...], seed: int) -> Row:
     """One search: at each budget its best plan so far, that plan's l2 reduction and IoU; and the curve of all of them."""
     loss = SandLoss(goal.scene, goal.start, goal.goal)
     began = time.perf_counter()
-    found = search(loss, len(goal.strokes), loss.bounds, max(budgets), seed)
+    found = method(loss, len(goal.strokes), loss.bounds, max(budgets), seed)
     seconds = time.perf_counter() - began
     before = float(((goal.start.astype(float) - goal.goal) ** 2).sum())
     marks = [_at(found.history, budget) for budget in budgets]
@@ -169,13 +198,13 @@ def bench_strokes(
     tell: Tell = lambda _: None,
     seed: int = 0,
     out: Path | None = None,
-    methods: dict[str, Search] | None = None,
+    methods: dict[str, Method] | None = None,
     budgets: tuple[int, ...] = BUDGETS[:2],
     names: str = string.ascii_uppercase,
 ) -> dict[str, list[Row]]:
     """Every method on letters on level sand, with one seed."""
     tell("making the goals")
-    rows = run_all(methods or RIVALS, letters(names), budgets, (seed,), out, tell)
+    rows = run_all(methods or METHODS, letters(names), budgets, (seed,), out, tell)
     return {"strokes": reached(rows), "strokes_by_goal": [_line(row) for row in rows], "strokes_curves": rows}
 
 

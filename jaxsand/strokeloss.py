@@ -5,22 +5,40 @@ length, each core taking the next group, longest first. While the blade is down 
 touches the window's edge is pushed again on the whole map. `Whole` and windows give the same maps up to rounding (1e-7 m).
 """
 
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Protocol
 
 import jax
 import numpy as np
 
-from jaxsand.batch import cores
+from jaxsand.batch import cores, wide_vectors
 from jaxsand.rules import Outcome
 from jaxsand.scene import Scene
-from jaxsand.sim import step_batch
+from jaxsand.sim import step, step_batch
 from jaxsand.task import fits
 from jaxsand.window import Whole, Window
 
+GRADIENT = 5
+"""Calls that going back through one stroke costs, as `jaxsand bench grad` measures it, rounded up."""
+
 _SIZES = (8, 16, 32, 64)  # of a group, on a CPU: a few, so that a scene compiles a few programs
 _WINDOW = (16, 16)
+
+
+Weigh = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""A loss of differences [P, H, W] (m): its values [P], and its gradient [P, H, W]."""
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best plan [N, 4] (m) after so many calls, and its loss (m^2)."""
+
+    calls: int
+    loss: float
+    strokes: np.ndarray
 
 
 class Evaluate(Protocol):
@@ -66,6 +84,20 @@ class SandLoss:
             maps = pushed(self.scene, maps, candidates[:, k])
         return maps
 
+    def gradient(self, candidates: np.ndarray, weigh: Weigh) -> tuple[np.ndarray, np.ndarray]:
+        """`weigh(maps - goal)` [P] of plans [P, N, 4] and its gradient by them; infinite, or NaN, where not clean.
+
+        `weigh` also gives its own gradient by the difference. Backwards, stroke by stroke, as the maps on the way are kept.
+        """
+        maps = [np.repeat(self.start[None].astype(np.float32), len(candidates), axis=0)]
+        for k in range(candidates.shape[1]):
+            maps.append(pushed(self.scene, maps[-1], candidates[:, k]))
+        value, back = weigh(maps[-1].astype(float) - self.goal)
+        out = np.zeros(candidates.shape)
+        for k in reversed(range(candidates.shape[1])):
+            back, out[:, k] = _pulled(self.scene, maps[k], candidates[:, k], back)
+        return np.where(np.isnan(value), np.inf, value), out
+
     @property
     def bounds(self) -> np.ndarray:
         """The lowest and the highest x0, y0, x1, y1 (m) of strokes from cell centre to cell centre of the map: [2, 4]."""
@@ -81,7 +113,7 @@ class SandLoss:
 def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     """What one stroke [P, 4] (m) each leaves of maps [P, H, W] (m) at rest; NaN where the outcome is not clean."""
     maps, strokes = np.asarray(maps, np.float32), np.asarray(strokes, np.float32)
-    if not isinstance(scene.window, Whole) or any(n < m for n, m in zip(scene.grid.shape, _WINDOW, strict=True)):
+    if not _windowed(scene):
         return _by_length(scene, maps, strokes)[0]
     after, outcome = _by_length(replace(scene, window=Window(_WINDOW)), maps, strokes)
     again = np.flatnonzero(outcome & Outcome.WINDOW_EDGE)
@@ -92,23 +124,59 @@ def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
 
 def _by_length(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The maps after one stroke each, and their outcomes."""
-    order = np.argsort(np.hypot(*(strokes[:, 2:] - strokes[:, :2]).T), kind="stable")[::-1]
-    size = _size(len(order))
-    groups = [order[i : i + size] for i in range(0, len(order), size)]
-
-    def one(group: np.ndarray) -> tuple[Any, Any]:
-        who = np.concatenate([group, np.repeat(group[-1:], size - len(group))])
-        shaped = step_batch(scene, maps[who], strokes[who], chunk=size)
-        return np.asarray(shaped.height), np.asarray(shaped.outcome)
-
     after, outcomes = np.empty_like(maps), np.zeros(len(maps), int)
-    with ThreadPoolExecutor(cores()) as pool:
-        for group, (height, outcome) in zip(groups, pool.map(one, groups), strict=True):
-            after[group], outcomes[group] = height[: len(group)], outcome[: len(group)]
+
+    def one(group: np.ndarray, who: np.ndarray) -> tuple[Any, Any]:
+        shaped = step_batch(scene, maps[who], strokes[who], chunk=len(who))
+        return shaped.height, shaped.outcome
+
+    for group, (height, outcome) in _grouped(strokes, one):
+        after[group], outcomes[group] = height, outcome
     after[(outcomes & ~Outcome.WINDOW_EDGE) != 0] = np.nan
     if isinstance(scene.window, Whole):
         after[outcomes != 0] = np.nan
     return after, outcomes
+
+
+def _pulled(scene: Scene, maps: np.ndarray, strokes: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The cotangents of maps [P, H, W] and strokes [P, 4] from those of what the strokes leave."""
+    scene = replace(scene, window=Window(_WINDOW)) if _windowed(scene) else scene
+    maps, strokes, back = (np.asarray(x, np.float32) for x in (maps, strokes, np.nan_to_num(back)))
+    of_maps, of_strokes = np.empty_like(maps), np.empty_like(strokes)
+
+    def one(group: np.ndarray, who: np.ndarray) -> tuple[Any, Any]:
+        return _pull_program()(scene, maps[who], strokes[who], back[who])
+
+    for group, (m, s) in _grouped(strokes, one):
+        of_maps[group], of_strokes[group] = m, s
+    return of_maps, of_strokes
+
+
+@cache
+def _pull_program() -> Any:
+    def pull(scene: Scene, height: jax.Array, stroke: jax.Array, back: jax.Array) -> Any:
+        return jax.vjp(lambda h, s: step(scene, h, s).height, height, stroke)[1](back)
+
+    return jax.jit(jax.vmap(pull, in_axes=(None, 0, 0, 0)), compiler_options=wide_vectors())
+
+
+def _grouped(strokes: np.ndarray, one: Callable) -> Iterator[tuple[np.ndarray, tuple]]:
+    """What `one(group, padded group)` gives for groups of strokes of like length, as long as the group."""
+    order = np.argsort(np.hypot(*(strokes[:, 2:] - strokes[:, :2]).T), kind="stable")[::-1]
+    size = _size(len(order))
+    groups = [order[i : i + size] for i in range(0, len(order), size)]
+
+    def part(group: np.ndarray) -> tuple:
+        out = one(group, np.concatenate([group, np.repeat(group[-1:], size - len(group))]))
+        return tuple(np.asarray(x)[: len(group)] for x in out)
+
+    with ThreadPoolExecutor(cores()) as pool:
+        yield from zip(groups, pool.map(part, groups), strict=True)
+
+
+def _windowed(scene: Scene) -> bool:
+    """Whether a window around the blade saves work."""
+    return isinstance(scene.window, Whole) and all(n >= m for n, m in zip(scene.grid.shape, _WINDOW, strict=True))
 
 
 def _size(count: int) -> int:

@@ -16,16 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.strokeloss import Evaluate
-
-
-@dataclass(frozen=True)
-class Best:
-    """The best plan [N, 4] (m) after so many calls, and its loss."""
-
-    calls: int
-    loss: float
-    strokes: np.ndarray
+from jaxsand.strokeloss import Best, Evaluate
 
 
 @dataclass(frozen=True)

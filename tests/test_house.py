@@ -24,7 +24,8 @@ FLOORS = [
     {"roll", "split"},
     {"sim"},
     {"task", "goals", "planner", "plain", "scans", "calibration", "sections"},
-    {"sandplan", "strokeloss"},
+    {"strokeloss"},
+    {"sandplan", "optimise"},
     {"shaping", "files", "rut", "strokerivals"},
     {"workprec", "stability", "complexity", "expansions", "sandbench", "rutbench", "strokebench"},
     {"analysis", "piles"},
@@ -42,6 +43,7 @@ INSIDE = {
         {"anytime"},
     ],
     "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],
+    "optimise": [{"account", "sketch"}, {"moves"}],
     "commands": [{"printing"}, {"shape", "settle", "plan", "trench", "bench"}],
 }
 HEAVY = {"matplotlib": {"render", "rutfigures", "strokefigures", "goals"}, "PIL": {"render", "goals"}}

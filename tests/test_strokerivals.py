@@ -143,7 +143,7 @@ def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch)
         return random_shooting(evaluate, n_strokes, bounds, min(budget, 16), seed)
 
     monkeypatch.setattr(strokebench, "letters", lambda _: [bar])
-    monkeypatch.setattr(strokebench, "RIVALS", {"random shooting": short})
+    monkeypatch.setattr(strokebench, "METHODS", {"random shooting": short})
     assert main(["bench", "strokes", "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "reached at 4000" in text

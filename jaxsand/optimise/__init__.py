@@ -1,0 +1,161 @@
+"""Strokes that turn a start map into a goal map, by gradients through the simulator.
+
+First guesses cost one call (sketch.py): the print of one stroke, matched to the goal. Then rounds of moves (moves.py) on
+several plans at once: other orders and directions, Adam on blurred and then on sharp maps, strokes put where sand is still
+due, L-BFGS, until the goal is reached or the budget is spent.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.optimise import moves
+from jaxsand.optimise.account import Account
+from jaxsand.optimise.sketch import Print, guesses
+from jaxsand.rules import check_whole
+from jaxsand.scene import Scene, as_array
+from jaxsand.strokeloss import Best, SandLoss, pushed
+from jaxsand.tool import Blade
+
+_LANES = 4  # plans that go downhill together
+_REACHED = 1e-4  # of the start's loss: near enough to stop
+_GAIN = 0.7  # one stroke more has to bring the loss below this share
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """What `optimise_strokes` found: the plan `strokes` [N, 4] (m), the `losses` (m^2) of the start and of every better plan
+    on the way with the `calls` (pushes simulated, a gradient counted at its cost) after which it was found, and the `height`
+    [H, W] (m) that the plan leaves."""
+
+    strokes: np.ndarray
+    losses: np.ndarray
+    calls: np.ndarray
+    height: np.ndarray
+
+
+def optimise_strokes(
+    scene: Scene,
+    goal: jax.typing.ArrayLike,
+    *,
+    strokes: int | None = None,
+    key: jax.Array | int = 0,
+    start: jax.typing.ArrayLike | None = None,
+    budget: int = 4_000,
+    most: int = 8,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Optimised:
+    """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
+
+    Minimises sum (h - goal)^2 over plans of `strokes` pushes, or of as many as pay, up to `most`, if None. Stops at a
+    ten-thousandth of the start's loss, or after about `budget` simulator calls. The same key finds the same plan on the same
+    machine. Not differentiable itself.
+
+    Raises:
+      ValueError: for a scene without a blade, a goal of another shape, or a count out of range.
+    """
+    if not isinstance(scene.tool, Blade):
+        raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
+    check_whole("budget", budget, 1)
+    check_whole("most", most, 1, 64)
+    if strokes is not None:
+        check_whole("strokes", strokes, 1, 64)
+    level = np.zeros(scene.grid.shape, np.float32)
+    sand = SandLoss(
+        scene,
+        level if start is None else np.asarray(as_array("start", start), np.float32),
+        np.asarray(as_array("goal", goal), np.float32),
+    )
+    rng = np.random.default_rng(np.asarray(_entropy(key)))
+    account = Account(sand, budget, tell)
+    if strokes is None:
+        as_many_as_pay(account, most, rng)
+    else:
+        search(account, strokes, rng)
+    plan = account.best.strokes if account.history else np.zeros((0, 4))
+    steps = [Best(0, account.before, plan[:0]), *account.history]
+    height = sand.maps(plan[None])[0]
+    return Optimised(plan, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), height)
+
+
+def search(account: Account, strokes: int, rng: np.random.Generator) -> None:
+    """Spends the account's budget on plans of so many strokes."""
+    mark = print_of(account)
+    plans = first(account, mark, strokes, rng)
+    if plans is not None:
+        improve(account, mark, plans, rng)
+
+
+def as_many_as_pay(account: Account, most: int, rng: np.random.Generator) -> None:
+    """Plans of one stroke, of two, and so on, each for a part of the budget, as long as one stroke more pays."""
+    mark = print_of(account)
+    whole, best = account.budget, account.before
+    for n in range(1, most + 1):
+        account.budget = min(whole, account.calls + max(whole // 10, 60 * n))
+        plans = first(account, mark, n, rng)
+        if plans is None:
+            break
+        improve(account, mark, plans, rng)
+        if account.best.loss > _GAIN * best or account.best.loss < _REACHED * account.before:
+            break
+        best = account.best.loss
+    account.budget = whole
+    if account.history and account.best.loss > _REACHED * account.before:
+        kept = account.best
+        improve(account, mark, (kept.strokes[None], np.array([kept.loss])), rng)
+
+
+def print_of(account: Account) -> Print:
+    """What one stroke of half the map's shorter side leaves of level sand."""
+    scene = account.sand.scene
+    rows, columns = scene.grid.shape
+    dx = float(scene.grid.spacing)
+    length = max(min(rows, columns) / 2, 1.0)
+    x, y = round((columns - length) / 2), round(rows / 2) + 0.5
+    stroke = np.array([[x, y, x + length, y]]) * dx
+    account.calls += 1
+    height = pushed(scene, np.zeros((1, rows, columns)), stroke)[0]
+    return Print(jnp.asarray(np.nan_to_num(height)), jnp.array([x - 0.5, y - 0.5], jnp.float32), jnp.float32(length))
+
+
+def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator) -> moves.Plans | None:
+    """Plans from the sketch, closest first; None if the budget is spent."""
+    dx = float(account.sand.scene.grid.spacing)
+    plans = guesses(mark, account.sand.goal - account.sand.start, strokes, rng) * dx
+    plans = np.clip(plans, *account.sand.bounds)
+    plans = plans[: max(1, min(len(plans), account.room(strokes) // 4))]
+    losses = account.losses(plans)
+    return moves.ranked(plans, losses, _LANES) if np.isfinite(losses).any() else None
+
+
+def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Generator) -> None:
+    """Rounds of moves until the goal is reached or the budget is spent."""
+    dx = float(account.sand.scene.grid.spacing)
+    plans = moves.reordered(account, plans)
+    plans = moves.adam(account, plans, 6, 0.15 * dx, blur=1.0)
+    while account.best.loss > _REACHED * account.before and account.room(plans[0].shape[1]) > 0:
+        last, spent = plans[1][0], account.calls
+        plans = moves.reordered(account, plans)
+        plans = moves.adam(account, plans, 8, 0.1 * dx)
+        plans = moves.replaced(account, mark, plans, rng)
+        front = moves.quasi_newton(account, (plans[0][:1], plans[1][:1]), 4)
+        plans = _joined(front, (plans[0][1:], plans[1][1:]))
+        if plans[1][0] > 0.98 * last:  # stuck: from beside the best plan
+            near = plans[0][:1] + rng.normal(0, 0.7 * dx, (_LANES - 1, *plans[0].shape[1:]))
+            near = np.clip(near, *account.sand.bounds)
+            plans = _joined((plans[0][:1], plans[1][:1]), (near, account.losses(near)))
+        if account.calls == spent:
+            break
+
+
+def _joined(a: moves.Plans, b: moves.Plans) -> moves.Plans:
+    return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
+
+
+def _entropy(key: jax.Array | int) -> np.ndarray:
+    if isinstance(key, int):
+        return np.array([key])
+    return np.asarray(jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key).ravel()
