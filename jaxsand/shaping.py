@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand import goals, task
+from jaxsand.optimise import Optimised, optimise_strokes
 from jaxsand.planner import Cell, connected_pieces, plan
 from jaxsand.push import SteppedPush
 from jaxsand.rules import UntilStill
@@ -64,7 +65,7 @@ class Target:
     depth: float
     optimal: bool | None = None  # whether the steps are proven fewest, and what is proven of them; plans only
     lower_bound: float | None = None
-    found: SandPlan | None = None  # what a search on real sand says of itself
+    found: SandPlan | Optimised | None = None  # what a search on real sand says of itself
 
     @property
     def footprint(self) -> tuple[float, float]:
@@ -181,6 +182,15 @@ def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: in
     tell(f"searching {strokes} strokes in about {pushes} pushes")
     found = plan_sand(target.scene, start, target.goal, strokes=strokes, budget=pushes, seed=seed)
     return replace(target, method="search", paths=found.paths, optimal=None, lower_bound=None, found=found)
+
+
+def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:
+    """The same goal, by so many strokes (as many as pay if None) from gradients, at a cost of about `pushes`."""
+    start = _at_rest(target.scene, before, tell)
+    tell("sketching")
+    found = optimise_strokes(target.scene, target.goal, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)
+    paths = tuple(stroke.reshape(2, 2) for stroke in found.strokes)
+    return replace(target, method="optimise", paths=paths, optimal=None, lower_bound=None, found=found)
 
 
 def terrain_surface(shape: tuple[int, int], relief: float) -> np.ndarray:

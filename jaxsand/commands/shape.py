@@ -12,6 +12,7 @@ from jaxsand.files import as_json, existing, folder, progress, read_text, writte
 if TYPE_CHECKING:
     import numpy as np
 
+    from jaxsand.optimise import Optimised
     from jaxsand.sandplan import SandPlan
     from jaxsand.shaping import Layout, ShapeResult, Target
 
@@ -21,21 +22,26 @@ def run_shape(options: argparse.Namespace) -> None:
     started = time.perf_counter()
     tell("reading the goal")
     from jaxsand.render import save_animation, save_figure, shape_figure
-    from jaxsand.shaping import searched, shape
+    from jaxsand.shaping import optimised, searched, shape
 
     began = time.perf_counter()
-    if options.method != "search":
+    looks = options.method in ("search", "optimise")
+    if not looks:
         for option in ("strokes", "pushes", "seed"):
             if getattr(options, option) is not None:
-                raise ValueError(f"{option}: has an effect with --method search only; leave it out")
+                raise ValueError(f"{option}: has an effect with --method search or optimise only; leave it out")
     target = _target(options)
-    if options.method == "search" and target.drawn:
-        raise ValueError(f"method: 'search' compares berms too, which {options.goal} has none of; use --method plan")
+    if looks and target.drawn:
+        raise ValueError(
+            f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method plan"
+        )
     surface = _surface(options, target)
     out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
     if options.method == "search":
         strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
         target = searched(target, surface, strokes, options.pushes or 1000 * strokes, options.seed or 0, tell)
+    if options.method == "optimise":
+        target = optimised(target, surface, options.strokes, options.pushes or 4000, options.seed or 0, tell)
     planned = time.perf_counter() - began
     result = shape(target, surface, tell)
     tell("drawing")
@@ -78,8 +84,13 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
     }
 
 
-def _found(found: "SandPlan") -> dict[str, Any]:
-    """l2 distances in m; `rollouts` counts rough pushes by what they cost."""
+def _found(found: "SandPlan | Optimised") -> dict[str, Any]:
+    """l2 distances in m; `rollouts` counts rough pushes and gradients by what they cost."""
+    from jaxsand.optimise import Optimised
+
+    if isinstance(found, Optimised):
+        far = [float(loss) ** 0.5 for loss in found.losses]
+        return {"before": far[0], "after": far[-1], "rollouts": int(found.spent), "found_after": int(found.calls[-1])}
     return {
         "before": found.before,
         "after": found.after,
@@ -97,7 +108,7 @@ def _summary(report: dict[str, Any]) -> str:
     if report["method"] == "plan":
         proof = "proven shortest" if report["optimal"] else f"at least {report['lower_bound']} are needed"
         how = f"{report['steps']} steps ({proof})"
-    if report["method"] == "search":
+    if "search" in report:
         how += f" found in {report['search']['rollouts']:.0f} pushes"
     return "\n".join(
         (

@@ -22,18 +22,19 @@ from jaxsand.tool import Blade
 
 _LANES = 4  # plans that go downhill together
 _REACHED = 1e-4  # of the start's loss: near enough to stop
-_GAIN = 0.7  # one stroke more has to bring the loss below this share
+_NEARLY = 1.15  # times the least of what sums of prints leave of the squared change
 
 
 @dataclass(frozen=True)
 class Optimised:
-    """What `optimise_strokes` found: the plan `strokes` [N, 4] (m), the `losses` (m^2) of the start and of every better plan
-    on the way with the `calls` (pushes simulated, a gradient counted at its cost) after which it was found, and the `height`
-    [H, W] (m) that the plan leaves."""
+    """What `optimise_strokes` found: the plan `strokes` [N, 4] (m) and the `height` [H, W] (m) that it leaves; the `losses`
+    (m^2) of the start and of every better plan on the way, the `calls` after which each was found, and those `spent` in all
+    (pushes simulated, a gradient counted at what it costs)."""
 
     strokes: np.ndarray
     losses: np.ndarray
     calls: np.ndarray
+    spent: int
     height: np.ndarray
 
 
@@ -51,7 +52,7 @@ def optimise_strokes(
     """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
 
     Minimises sum (h - goal)^2 over plans of `strokes` pushes, or of as many as pay, up to `most`, if None. Stops at a
-    ten-thousandth of the start's loss, or after about `budget` simulator calls. The same key finds the same plan on the same
+    ten-thousandth of the start's loss, or after `budget` simulator calls; with nothing to change there are no strokes. The same key finds the same plan on the same
     machine. Not differentiable itself.
 
     Raises:
@@ -71,41 +72,31 @@ def optimise_strokes(
     )
     rng = np.random.default_rng(np.asarray(_entropy(key)))
     account = Account(sand, budget, tell)
-    if strokes is None:
-        as_many_as_pay(account, most, rng)
-    else:
-        search(account, strokes, rng)
+    if account.before > 0:
+        search(account, strokes, rng, most)
     plan = account.best.strokes if account.history else np.zeros((0, 4))
     steps = [Best(0, account.before, plan[:0]), *account.history]
     height = sand.maps(plan[None])[0]
-    return Optimised(plan, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), height)
+    return Optimised(plan, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), account.calls, height)
 
 
-def search(account: Account, strokes: int, rng: np.random.Generator) -> None:
-    """Spends the account's budget on plans of so many strokes."""
+def search(account: Account, strokes: int | None, rng: np.random.Generator, most: int = 8) -> None:
+    """Spends the account's budget on plans of so many strokes, or of as many as pay."""
     mark = print_of(account)
-    plans = first(account, mark, strokes, rng)
+    plans = first(account, mark, strokes or as_many_as_pay(account, mark, most, rng), rng)
     if plans is not None:
         improve(account, mark, plans, rng)
 
 
-def as_many_as_pay(account: Account, most: int, rng: np.random.Generator) -> None:
-    """Plans of one stroke, of two, and so on, each for a part of the budget, as long as one stroke more pays."""
-    mark = print_of(account)
-    whole, best = account.budget, account.before
+def as_many_as_pay(account: Account, mark: Print, most: int, rng: np.random.Generator) -> int:
+    """The fewest strokes whose prints come nearly as close as those of any number up to `most`; without any calls."""
+    change = account.sand.goal - account.sand.start
+    far: list[float] = []
     for n in range(1, most + 1):
-        account.budget = min(whole, account.calls + max(whole // 10, 60 * n))
-        plans = first(account, mark, n, rng)
-        if plans is None:
+        far.append(guesses(mark, change, n, rng)[1][0])
+        if n > 2 and min(far[-2:]) > min(far):  # the prints of more only get in each other's way
             break
-        improve(account, mark, plans, rng)
-        if account.best.loss > _GAIN * best or account.best.loss < _REACHED * account.before:
-            break
-        best = account.best.loss
-    account.budget = whole
-    if account.history and account.best.loss > _REACHED * account.before:
-        kept = account.best
-        improve(account, mark, (kept.strokes[None], np.array([kept.loss])), rng)
+    return 1 + next(n for n, left in enumerate(far) if left <= _NEARLY * min(far))
 
 
 def print_of(account: Account) -> Print:
@@ -124,7 +115,7 @@ def print_of(account: Account) -> Print:
 def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator) -> moves.Plans | None:
     """Plans from the sketch, closest first; None if the budget is spent."""
     dx = float(account.sand.scene.grid.spacing)
-    plans = guesses(mark, account.sand.goal - account.sand.start, strokes, rng) * dx
+    plans = guesses(mark, account.sand.goal - account.sand.start, strokes, rng)[0] * dx
     plans = np.clip(plans, *account.sand.bounds)
     plans = plans[: max(1, min(len(plans), account.room(strokes) // 4))]
     losses = account.losses(plans)

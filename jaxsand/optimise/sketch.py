@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.scipy.ndimage import map_coordinates
-from scipy.ndimage import gaussian_filter
 
 _POINTS = 48  # cells between which strokes are tried
 _PLANS = 16  # that matching keeps
@@ -22,6 +21,9 @@ _CHILDREN = 6  # of one plan among them
 _BLURS = (1.5, 0.75, 0.0)  # standard deviations in cells
 _ITERATIONS = 60  # of Adam for each blur
 _STEP = 0.15  # of Adam, in cells
+_TOGETHER = 8  # plans are filled up to so many strokes with strokes off the map, so that they share a program
+_NOWHERE = np.array([-1e3, -1e3, -1e3 + 1, -1e3], np.float32)
+_SCALE = 1e4  # squared metres to about 1
 
 
 @jax.tree_util.register_dataclass
@@ -36,7 +38,9 @@ class Print:
 
 def prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """What strokes [..., 4] (in cells, cell centres at whole numbers and a half) leave of level sand: [..., H, W]."""
-    x, y = jnp.arange(shape[1]) + 0.5, jnp.arange(shape[0])[:, None] + 0.5
+    ones = (1,) * (strokes.ndim - 1)
+    x = (jnp.arange(shape[1], dtype=strokes.dtype) + 0.5).reshape(*ones, 1, shape[1])
+    y = (jnp.arange(shape[0], dtype=strokes.dtype) + 0.5).reshape(*ones, shape[0], 1)
     x0, y0, x1, y1 = (strokes[..., k, None, None] for k in range(4))
     dx, dy = x1 - x0, y1 - y0
     length = jnp.sqrt(dx * dx + dy * dy + 1e-12)
@@ -48,23 +52,28 @@ def prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Array
     return map_coordinates(mark.height, where, order=1, mode="constant", cval=0.0)
 
 
-def guesses(mark: Print, change: np.ndarray, strokes: int, rng: np.random.Generator) -> np.ndarray:
-    """Plans [P, N, 4] (cells) whose prints add up to `change` [H, W] (m), the closest first."""
+def guesses(mark: Print, change: np.ndarray, strokes: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Plans [P, N, 4] (cells) whose prints add up to `change` [H, W] (m), the closest first; and the shares [P] of the
+    squared change that they leave."""
     plans = _matched(mark, change, strokes, rng)
+    count = len(plans)
+    filled = np.broadcast_to(_NOWHERE, (_PLANS, -(-strokes // _TOGETHER) * _TOGETHER, 4)).copy()
+    filled[:count, :strokes] = plans
+    moved = jnp.asarray(filled)
     for blur in _BLURS:
-        plans, far = _moved(mark, plans, jnp.asarray(_blurred(change, blur)), blur)
-    order = np.argsort(np.asarray(far), kind="stable")
-    return np.asarray(plans, float)[order]
+        bell = np.exp(-0.5 * (np.arange(-6, 7) / max(blur, 1e-3)) ** 2)
+        moved, far = _moved(mark, moved, jnp.asarray(change), jnp.asarray(bell / bell.sum(), jnp.float32))
+    left = np.asarray(far, float)[:count] / max(float((change**2).sum()) * _SCALE, 1e-30)
+    order = np.argsort(left, kind="stable")
+    return np.asarray(moved, float)[order, :strokes], left[order]
 
 
-def _blurred(change: np.ndarray, blur: float) -> np.ndarray:
-    return gaussian_filter(change, blur) if blur else change
-
-
-def _matched(mark: Print, change: np.ndarray, strokes: int, rng: np.random.Generator) -> jax.Array:
+def _matched(mark: Print, change: np.ndarray, strokes: int, rng: np.random.Generator) -> np.ndarray:
     ways = _ways(change, rng)
     shape = change.shape
-    each = np.asarray(_prints(mark, jnp.asarray(ways), shape), np.float32).reshape(len(ways), -1)
+    filled = np.broadcast_to(_NOWHERE, (_POINTS * (_POINTS - 1), 4)).astype(np.float32)
+    filled[: len(ways)] = ways
+    each = np.asarray(_prints(mark, jnp.asarray(filled), shape), np.float32)[: len(ways)].reshape(len(ways), -1)
     own = (each**2).sum(1)
     left = change.astype(np.float32).reshape(1, -1)
     plans = np.zeros((1, 0), int)
@@ -88,7 +97,7 @@ def _matched(mark: Print, change: np.ndarray, strokes: int, rng: np.random.Gener
         _, first = np.unique(np.sort(plans[order], axis=1), axis=0, return_index=True)
         kept_ones = order[np.sort(first)][:_PLANS]
         plans, left = plans[kept_ones], after[kept_ones]
-    return jnp.asarray(ways[plans], jnp.float32)
+    return ways[plans]
 
 
 def _ways(change: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -118,20 +127,16 @@ def _adam() -> Any:
     return optax.adam(_STEP)
 
 
-@partial(jax.jit, static_argnames="blur")
-def _moved(mark: Print, plans: jax.Array, change: jax.Array, blur: float) -> tuple[jax.Array, jax.Array]:
-    taps = np.exp(-0.5 * (np.arange(-6, 7) / max(blur, 1e-3)) ** 2)
-    kernel = jnp.asarray(taps / taps.sum(), jnp.float32)
-
+@jax.jit
+def _moved(mark: Print, plans: jax.Array, change: jax.Array, taps: jax.Array) -> tuple[jax.Array, jax.Array]:
     def smooth(h: jax.Array) -> jax.Array:
-        if not blur:
-            return h
         for axis in (0, 1):
-            h = jnp.apply_along_axis(lambda row: jnp.convolve(row, kernel, mode="same"), axis, h)
+            h = jnp.apply_along_axis(lambda row: jnp.convolve(row, taps, mode="same"), axis, h)
         return h
 
     def far(plan: jax.Array) -> jax.Array:
-        return jnp.sum((smooth(jnp.sum(prints(mark, plan, (change.shape[0], change.shape[1])), axis=0)) - change) ** 2) * 1e4
+        added = jnp.sum(prints(mark, plan, (change.shape[0], change.shape[1])), axis=0)
+        return jnp.sum(smooth(added - change) ** 2) * _SCALE
 
     def step(carry: Any, _: Any) -> tuple[Any, None]:
         plans, state = carry
