@@ -52,8 +52,8 @@ def optimise_strokes(
     """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
 
     Minimises sum (h - goal)^2 over plans of `strokes` pushes, or of as many as pay, up to `most`, if None. Stops at a
-    ten-thousandth of the start's loss, or after `budget` simulator calls; with nothing to change there are no strokes. The same key finds the same plan on the same
-    machine. Not differentiable itself.
+    ten-thousandth of the start's loss, or after `budget` simulator calls; with nothing to change there are no strokes. The
+    same key finds the same plan on the same machine. Not differentiable itself.
 
     Raises:
       ValueError: for a scene without a blade, a goal of another shape, or a count out of range.
