@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxsand.bed import Bed, halo
 from jaxsand.grid import links
@@ -39,6 +40,13 @@ def pairs(bed: Bed, u: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
 def steps(bed: Bed, u: jax.Array) -> Lattice:
     """The step over every link, from its first to its second cell."""
     return tuple(there - here for here, there in pairs(bed, u))
+
+
+def stored(flow: list[jax.Array]) -> list[jax.Array]:
+    """The maps, computed once: by concatenation, lest XLA compute them anew in all that uses them."""
+    both = lax.optimization_barrier(lax.concatenate(flow, 0))
+    rows = flow[0].shape[0]
+    return [both[k * rows : (k + 1) * rows] for k in range(len(flow))]
 
 
 def gains(bed: Bed, flow: Lattice) -> jax.Array:

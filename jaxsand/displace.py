@@ -19,7 +19,7 @@ from jaxsand.loop import Plain, repeat, repeat_until
 from jaxsand.sweep import Flow, Sweep
 from jaxsand.tool import Pose, local
 
-_EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
+EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]
 
 
@@ -67,7 +67,7 @@ def pass_on(
         room = room + job.bed.rim.beyond
     source = halo(carried, 0.0)
     received, kept = jnp.zeros_like(h), carried
-    for (di, dj), s in zip(_EIGHT, share, strict=True):
+    for (di, dj), s in zip(EIGHT, share, strict=True):
         given = whole(job, s * carried) * at(room, di, dj)
         kept = kept - given
         s_there = at(halo(s, 0.0), -di, -dj) if s.ndim else s
@@ -86,7 +86,7 @@ def shares(p: jax.Array, q: jax.Array) -> Shares:
     columns = {-1: jnp.maximum(-p, 0), 0: 1 - jnp.abs(p), 1: jnp.maximum(p, 0)}
     rows = {-1: jnp.maximum(-q, 0), 0: 1 - jnp.abs(q), 1: jnp.maximum(q, 0)}
     stay = rows[0] * columns[0] / 4
-    return [rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in _EIGHT]
+    return [rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in EIGHT]
 
 
 def radial(job: Job, pose: Pose) -> Shares:
@@ -120,7 +120,7 @@ def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
     Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
     """
     near = jnp.clip(1 + (h - job.bottom) / job.bed.spacing, 0, 1)
-    return jnp.minimum(1, 2 * jnp.max(jnp.where(jnp.isnan(h), 0, near) * cover))
+    return jnp.minimum(1, 2 * jnp.max(jnp.max(jnp.where(jnp.isnan(h), 0, near) * cover, axis=0)))
 
 
 def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:

@@ -27,9 +27,13 @@ def sweep(bed: Bed, flow: Flow, around: Nothing | Around | Partial, u: jax.Array
 
     `lost` gathers the height that left each cell over a draining rim (see `lose`); None where nothing drains.
     """
+    return apply(bed, flow, counted(flow, fluxes(bed, around, u)), u, lost)
+
+
+def counted(flow: Flow, driven: Fluxes) -> Fluxes:
+    """The whole quanta that cross the links for the fluxes at rate 1."""
     scale = flow.rate / flow.quantum
-    moved = lax.optimization_barrier(tuple(truncate(f * scale) for f in fluxes(bed, around, u)))
-    return apply(bed, flow, moved, u, lost)
+    return lax.optimization_barrier(tuple(truncate(f * scale) for f in driven))
 
 
 def surge(
