@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand import around, window
-from jaxsand.around import total
+from jaxsand.adjoint import total
 from jaxsand.bed import Lost, at, halo
 from jaxsand.displace import EIGHT, Job, Shares, contact, pass_on, settle_around, shares, take
 from jaxsand.flux import NARROW, stand
@@ -52,6 +52,7 @@ class Advance:
 
     substep: float
     sweeps: int
+    tape: int = 64
 
     def __call__(self, params: Any, k: jax.Array, state: State) -> State:
         scene, job, start, length = params
@@ -77,7 +78,7 @@ class Advance:
 
     def pull(self, params: Any, k: jax.Array, record: State, cotangent: State) -> tuple[Any, State]:
         scene, job, start, length = params
-        if job.bed.neighbours == "isotropic" or job.bed.rim is not None or not self.sweeps:
+        if not around.by_hand(job.bed) or not self.sweeps:
             return Plain(self).pull(params, k, record, cotangent)
         way, onto_way = jax.vjp(lambda start, length: step_ahead(self.substep, job, start, length, k), start, length)
         h, gain = record[0], cotangent[0]

@@ -7,17 +7,53 @@ length, a sweep moves h by G (rate g e / l); see adjoint.py. With y = D lambda, 
     M = sum of sigma g y  gives  rate M       for the largest stable step of a straight link.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import adjoint
-from jaxsand.bed import Bed, at, halo
+from jaxsand.bed import Bed, Lost, at, halo
 from jaxsand.flux import Around, flows
 from jaxsand.grid import links
-from jaxsand.sweep import Flow, apply, counted
+from jaxsand.loop import Plain, repeat, split
+from jaxsand.sweep import Flow, Sweep, apply, counted
+
+
+@dataclass(frozen=True)
+class Beside:
+    """So many sweeps around a tool as one step of a loop; `params` are the bed, the flow and the tool that stands there."""
+
+    sweeps: int
+    tape: int = 1
+
+    def __call__(self, params: Any, k: jax.Array, state: tuple[jax.Array, Lost]) -> tuple[jax.Array, Lost]:
+        h, lost = state
+        u, lost = repeat(Sweep(), self.sweeps, params, (halo(h), lost))
+        return at(u), lost
+
+    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+        return self(params, k, state), state
+
+    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+        return Plain(self).push(params, k, record, dparams, dstate)
+
+    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+        bed, flow, around = params
+        if not by_hand(bed) or not self.sweeps:
+            return Plain(self).pull(params, k, record, cotangent)
+        of = pull(bed, flow, around, surfaces(bed, flow, around, self.sweeps, record[0]), cotangent[0])
+        dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
+        daround = replace(daround, open=halo(of.open, 0.0), stretch=of.stretch, bottom=of.bottom)
+        dparams = (replace(dbed, drop=of.drop), replace(dflow, rate=of.rate), daround)
+        return split(dparams)[0], (of.height, None)
+
+
+def by_hand(bed: Bed) -> bool:
+    """Whether the derivatives here hold: sand flows in pairs and over no rim."""
+    return bed.neighbours != "isotropic" and bed.rim is None
 
 
 @dataclass(frozen=True)
@@ -31,11 +67,6 @@ class Pulled:
     bottom: jax.Array
     rate: jax.Array
     drop: jax.Array
-
-
-def total(x: jax.Array) -> jax.Array:
-    """The sum of a map, rows first: XLA vectorises that."""
-    return jnp.sum(jnp.sum(x, axis=0))
 
 
 def surfaces(bed: Bed, flow: Flow, around: Around, sweeps: int, height: jax.Array) -> jax.Array:
@@ -98,14 +129,16 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
     gain, excess, tilt, lift, moved = lax.fori_loop(0, sweeps, stage, carry)
     per_length = [e / length for e, length in zip(excess, lengths, strict=True)]
     if per_cell:
-        drop = adjoint.drop_cotangent(bed, [flow.rate * g / length * t for g, length, t in zip(gates, lengths, tilt, strict=True)])
+        drop = adjoint.drop_cotangent(
+            bed, [flow.rate * g / length * t for g, length, t in zip(gates, lengths, tilt, strict=True)]
+        )
     else:
-        drop = flow.rate * total(tilt[0])
+        drop = flow.rate * adjoint.total(tilt[0])
     return Pulled(
         gain,
         -flow.rate * at(adjoint.to_less_open(bed, around.open, per_length)),
         moved / (1 + around.stretch),
-        -total(lift * around.stretch),
-        -total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
+        -adjoint.to_shape(lift * around.stretch, around.bottom),
+        -adjoint.total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
         drop,
     )

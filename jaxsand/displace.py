@@ -13,10 +13,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.around import Beside
 from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
 from jaxsand.flux import stand
-from jaxsand.loop import Plain, repeat, repeat_until
-from jaxsand.sweep import Flow, Sweep
+from jaxsand.loop import Plain, repeat, repeat_until, split
+from jaxsand.sweep import Flow
 from jaxsand.tool import Pose, local
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
@@ -110,7 +111,8 @@ def spread(
 ) -> tuple[jax.Array, Lost]:
     """Hands `carried` on until all of it rests."""
     rows, columns = h.shape
-    (h, lost, carried), _ = repeat_until(_at_rest, Plain(_onward), rows + columns, (job, share, free), (h, lost, carried))
+    params = (job, share, free)
+    (h, lost, carried), _ = repeat_until(_at_rest, Onward(), rows + columns, params, (h, lost, carried))
     return h + carried, lost
 
 
@@ -125,17 +127,49 @@ def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
 
 def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
     """Sweeps the sand around a blade that covers the share `cover` of each cell."""
-    around = stand(cover, job.bottom)
-    h, lost = repeat(Sweep(), sweeps, (job.bed, flow, around), (halo(h), lost))
-    return at(h), lost
+    return repeat(Beside(sweeps), 1, (job.bed, flow, stand(cover, job.bottom)), (h, lost))
 
 
 def _at_rest(params: Any, _: jax.Array, state: Any) -> jax.Array:
     return ~jnp.any(state[2] > 0)
 
 
-def _onward(params: Any, _: jax.Array, state: Any) -> Any:
-    return pass_on(*params, *state)
+@dataclass(frozen=True)
+class Onward:
+    """Sand handed on by one cell as a step of a loop; `params` are the job, the shares [H, W] and what is free.
+
+    With c what is carried, r what cells receive and f what of it rests there, lambda and kappa the cotangents of the height and
+    of what is carried on, and rho = f lambda + (1 - f) kappa where there is room, backwards: (lambda - kappa) r for f, for the
+    share s of a neighbour with room c (rho there - lambda here), and for c lambda and the sum of s times the same.
+    """
+
+    tape: int = 16
+
+    def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
+        return pass_on(*params, *state)
+
+    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+        return self(params, k, state), state
+
+    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+        return Plain(self).push(params, k, record, dparams, dstate)
+
+    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+        job, share, free = params
+        if job.bed.rim is not None or isinstance(free, Hanging) or not share[0].ndim:
+            return Plain(self).pull(params, k, record, cotangent)
+        (h, _, carried), (gain, _, onward) = record, cotangent
+        holds = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
+        room, there = halo(holds, 0.0), halo(holds * (free * gain + (1 - free) * onward), 0.0)
+        received, of_carried, of_share = jnp.zeros_like(h), gain, []
+        for (di, dj), s in zip(EIGHT, share, strict=True):
+            more = at(there, di, dj) - gain * at(room, di, dj)
+            received = received + at(halo(s * carried, 0.0), -di, -dj)
+            of_carried = of_carried + s * more
+            of_share.append(carried * more)
+        of_free = received * holds * (gain - onward)
+        floats = split((jax.tree.map(jnp.zeros_like, job), of_share, of_free))[0]
+        return floats, (gain, None, of_carried)
 
 
 def whole(job: Job, amount: jax.Array) -> jax.Array:
