@@ -1,8 +1,8 @@
 """One sub-step of a blade, and its derivative by hand where sand flows in pairs and nothing drains.
 
-With covers b before, w swept and a after, the sub-step takes c = s r from the cells, s = (w - b) / (1 - b) and r = h - bottom
-where that is positive; hands it on twice and settles what that gives. With T what neighbours receive and K what leaves,
-G = T - K, all of them linear,
+With covers b before, w swept and a after, the sub-step takes c = s r from the cells, s = (w - b) / (1 - b) and
+r = h - bottom where that is positive; hands it on twice and settles what that gives. With T what neighbours receive and K
+what leaves, G = T - K, all of them linear,
 
     h3 = h + G c + G (w T c).
 

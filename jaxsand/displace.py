@@ -138,9 +138,9 @@ def _at_rest(params: Any, _: jax.Array, state: Any) -> jax.Array:
 class Onward:
     """Sand handed on by one cell as a step of a loop; `params` are the job, the shares [H, W] and what is free.
 
-    With c what is carried, r what cells receive and f what of it rests there, lambda and kappa the cotangents of the height and
-    of what is carried on, and rho = f lambda + (1 - f) kappa where there is room, backwards: (lambda - kappa) r for f, for the
-    share s of a neighbour with room c (rho there - lambda here), and for c lambda and the sum of s times the same.
+    With c what is carried, r what cells receive and f what of it rests there, lambda and kappa the cotangents of the height
+    and of what is carried on, and rho = f lambda + (1 - f) kappa where there is room, backwards: (lambda - kappa) r for f,
+    c (rho there - lambda here) for the share s of a neighbour with room, and lambda + the sum of s (the same) for c.
     """
 
     tape: int = 16

@@ -26,7 +26,9 @@ class Step(Protocol):
     All of these are pure, and none closes over traced values.
     """
 
-    tape: int  # how many records are kept at hand; of a longer loop the earlier ones are restored
+    @property
+    def tape(self) -> int:
+        """How many records are kept at hand; of a longer loop the earlier ones are restored."""
 
     def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree: ...
 
@@ -86,8 +88,8 @@ def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) 
     last state and the number of steps taken.
 
     Differentiable once, in both modes, with respect to the floats of `params` and `state`, the number of steps held fixed.
-    Forward mode repeats the primal steps. Reverse mode keeps what the last `step.tape` steps recorded and, whatever the bound,
-    up to `lockstep.KEPT` states; from these it restores the earlier records of longer loops, which costs about one more
+    Forward mode repeats the primal steps. Reverse mode keeps what the last `step.tape` steps recorded and, whatever the
+    bound, up to `lockstep.KEPT` states; from these it restores the earlier records of longer loops, which costs about one more
     forward pass, and half of one more for each doubling beyond `KEPT` tapes. A second derivative raises NotImplementedError.
     """
     return _loop(lockstep.Lanes(done, step, bound, 0), params, state)

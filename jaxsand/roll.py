@@ -23,12 +23,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.advance import step_ahead
 from jaxsand.bed import Lost
 from jaxsand.displace import Hanging, Job, Shares, contact, outwards, pass_on, settle_around, shares, spread, whole
 from jaxsand.flux import NARROW
 from jaxsand.legs import Pushed, State, along_legs, in_window, over_the_map
 from jaxsand.loop import Plain, repeat_until
-from jaxsand.advance import step_ahead
 from jaxsand.push import SteppedPush, arrived
 from jaxsand.scene import Scene
 from jaxsand.swath import complete
