@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand import around, window
+from jaxsand import adjoint, around, window
 from jaxsand.adjoint import total
 from jaxsand.bed import Lost, at, halo
 from jaxsand.displace import EIGHT, Job, Shares, contact, pass_on, settle_around, shares, take
@@ -120,7 +120,7 @@ class Advance:
         # The sand that was handed on.
         holds = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
         room, there = halo(holds, 0.0), halo(holds * of.height, 0.0)
-        mu = _stencil(share, there) - of.height * _stencil(share, room)
+        mu = at(halo(_stencil(share, there) - of.height * _stencil(share, room), 0.0))
         onward = halo(holds * swept * mu, 0.0)
         received = _stencil(share[::-1], halo(first, 0.0)) * holds
         of_taken = mu + _stencil(share, onward)
@@ -190,26 +190,45 @@ def _pull_covers(job: Job, pose: Pose, ahead: jax.Array, cotangents: tuple) -> t
     """The cotangents of the pose, and of the blade's width and thickness and the way ahead, from those of the covers."""
     dx = job.bed.spacing
 
-    def covers(along: jax.Array, across: jax.Array, size: tuple) -> tuple[jax.Array, ...]:
-        width, thickness, ahead = size
-        beside, half = interval(across, -width / 2, width / 2, dx), thickness / 2
-        ways = ((-half, half + _LESS * dx), (-half, half + ahead), (ahead - half, ahead + half))
-        return tuple(interval(along, start, stop, dx) * beside for start, stop in ways)
-
     along, across = local(pose, job.x, job.y)
-    # The blade's size once for each column, so that sums run over rows first.
-    size = [jnp.broadcast_to(n, job.x.shape) for n in (job.tool.width, job.tool.thickness, ahead)]
-    _, back = jax.vjp(covers, along, across, tuple(size))
-    of_along, of_across, of_size = back(cotangents)
-    px, py = job.x - pose.x, job.y - pose.y
-    (a, ay), (c, cy) = [(jnp.sum(x, axis=0), jnp.sum(x * py, axis=0)) for x in (of_along, of_across)]
+    half, side = job.tool.thickness / 2, job.tool.width / 2
+    begin, less, ahead_end, moved = (-half, half + _LESS * dx, half + ahead, ahead - half)
+
+    def rising(s: jax.Array, edge: jax.Array) -> jax.Array:
+        part = (s - edge) / dx + 0.5
+        return jnp.where((part > 0) & (part < 1), 1 / dx, 0)
+
+    of_before, of_swept, of_after = adjoint.stored(list(cotangents))
+    beside = interval(across, -side, side, dx)
+    covered = (
+        of_before * interval(along, begin, less, dx)
+        + of_swept * interval(along, begin, ahead_end, dx)
+        + of_after * interval(along, moved, ahead_end, dx)
+    )
+    # One map for each edge of the intervals: how much more they would cover if that edge moved outwards.
+    edges = adjoint.stored(
+        [
+            (of_before + of_swept) * beside * rising(along, begin),
+            of_before * beside * rising(along, less),
+            (of_swept + of_after) * beside * rising(along, ahead_end),
+            of_after * beside * rising(along, moved),
+            covered * rising(across, -side),
+            covered * rising(across, side),
+        ]
+    )
+    rear, less_front, front, moved_rear, right, left = [jnp.sum(e, axis=0) for e in edges]
+    py = job.y - pose.y
+    ay = jnp.sum((edges[0] + edges[3] - edges[1] - edges[2]) * py, axis=0)
+    cy = jnp.sum((edges[4] - edges[5]) * py, axis=0)
+    a, c, px = rear + moved_rear - less_front - front, right - left, job.x[0] - pose.x
     dpose = Pose(
         jnp.sum(c * pose.sin - a * pose.cos),
         jnp.sum(-a * pose.sin - c * pose.cos),
-        jnp.sum(a * px[0] + cy),
-        jnp.sum(ay - c * px[0]),
+        jnp.sum(a * px + cy),
+        jnp.sum(ay - c * px),
     )
-    return dpose, tuple(jnp.sum(x) for x in of_size)
+    thickness = jnp.sum(rear + moved_rear + less_front + front) / 2
+    return dpose, (jnp.sum(right + left) / 2, thickness, jnp.sum(front - moved_rear))
 
 
 def _stretching(cover: jax.Array) -> jax.Array:

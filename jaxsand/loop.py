@@ -89,8 +89,9 @@ def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) 
 
     Differentiable once, in both modes, with respect to the floats of `params` and `state`, the number of steps held fixed.
     Forward mode repeats the primal steps. Reverse mode keeps what the last `step.tape` steps recorded and, whatever the
-    bound, up to `lockstep.KEPT` states; from these it restores the earlier records of longer loops, which costs about one more
-    forward pass, and half of one more for each doubling beyond `KEPT` tapes. A second derivative raises NotImplementedError.
+    bound, up to `lockstep.KEPT` states; from these it restores the earlier records of longer loops, which costs about one
+    more forward pass, and half of one more for each doubling beyond `KEPT` tapes. A second derivative raises
+    NotImplementedError.
     """
     return _loop(lockstep.Lanes(done, step, bound, 0), params, state)
 
