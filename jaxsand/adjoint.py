@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxsand.bed import Bed, halo
 from jaxsand.grid import links
@@ -39,6 +40,13 @@ def pairs(bed: Bed, u: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
 def steps(bed: Bed, u: jax.Array) -> Lattice:
     """The step over every link, from its first to its second cell."""
     return tuple(there - here for here, there in pairs(bed, u))
+
+
+def stored(flow: list[jax.Array]) -> list[jax.Array]:
+    """The maps, computed once: by concatenation, lest XLA compute them anew in all that uses them."""
+    both = lax.optimization_barrier(lax.concatenate(flow, 0))
+    rows = flow[0].shape[0]
+    return [both[k * rows : (k + 1) * rows] for k in range(len(flow))]
 
 
 def gains(bed: Bed, flow: Lattice) -> jax.Array:
@@ -116,6 +124,11 @@ def to_less_open(bed: Bed, gate: jax.Array, parts: list[jax.Array]) -> jax.Array
     return halo(jnp.asarray(net), 0.0)
 
 
+def total(x: jax.Array) -> jax.Array:
+    """The sum of a map, rows first: XLA vectorises that."""
+    return jnp.sum(jnp.sum(x, axis=0))
+
+
 def to_shape(cotangent: jax.Array, like: jax.Array) -> jax.Array:
     """The cotangent of what was broadcast to a map."""
-    return cotangent if like.ndim else jnp.sum(cotangent)
+    return cotangent if like.ndim else total(cotangent)

@@ -13,13 +13,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.around import Beside
 from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
 from jaxsand.flux import stand
-from jaxsand.loop import Plain, repeat, repeat_until
-from jaxsand.sweep import Flow, Sweep
+from jaxsand.loop import Plain, repeat, repeat_until, split
+from jaxsand.sweep import Flow
 from jaxsand.tool import Pose, local
 
-_EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
+EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]
 
 
@@ -67,7 +68,7 @@ def pass_on(
         room = room + job.bed.rim.beyond
     source = halo(carried, 0.0)
     received, kept = jnp.zeros_like(h), carried
-    for (di, dj), s in zip(_EIGHT, share, strict=True):
+    for (di, dj), s in zip(EIGHT, share, strict=True):
         given = whole(job, s * carried) * at(room, di, dj)
         kept = kept - given
         s_there = at(halo(s, 0.0), -di, -dj) if s.ndim else s
@@ -86,7 +87,7 @@ def shares(p: jax.Array, q: jax.Array) -> Shares:
     columns = {-1: jnp.maximum(-p, 0), 0: 1 - jnp.abs(p), 1: jnp.maximum(p, 0)}
     rows = {-1: jnp.maximum(-q, 0), 0: 1 - jnp.abs(q), 1: jnp.maximum(q, 0)}
     stay = rows[0] * columns[0] / 4
-    return [rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in _EIGHT]
+    return [rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in EIGHT]
 
 
 def radial(job: Job, pose: Pose) -> Shares:
@@ -110,7 +111,8 @@ def spread(
 ) -> tuple[jax.Array, Lost]:
     """Hands `carried` on until all of it rests."""
     rows, columns = h.shape
-    (h, lost, carried), _ = repeat_until(_at_rest, Plain(_onward), rows + columns, (job, share, free), (h, lost, carried))
+    params = (job, share, free)
+    (h, lost, carried), _ = repeat_until(_at_rest, Onward(), rows + columns, params, (h, lost, carried))
     return h + carried, lost
 
 
@@ -120,22 +122,54 @@ def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
     Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
     """
     near = jnp.clip(1 + (h - job.bottom) / job.bed.spacing, 0, 1)
-    return jnp.minimum(1, 2 * jnp.max(jnp.where(jnp.isnan(h), 0, near) * cover))
+    return jnp.minimum(1, 2 * jnp.max(jnp.max(jnp.where(jnp.isnan(h), 0, near) * cover, axis=0)))
 
 
 def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
     """Sweeps the sand around a blade that covers the share `cover` of each cell."""
-    around = stand(cover, job.bottom)
-    h, lost = repeat(Sweep(), sweeps, (job.bed, flow, around), (halo(h), lost))
-    return at(h), lost
+    return repeat(Beside(sweeps), 1, (job.bed, flow, stand(cover, job.bottom)), (h, lost))
 
 
 def _at_rest(params: Any, _: jax.Array, state: Any) -> jax.Array:
     return ~jnp.any(state[2] > 0)
 
 
-def _onward(params: Any, _: jax.Array, state: Any) -> Any:
-    return pass_on(*params, *state)
+@dataclass(frozen=True)
+class Onward:
+    """Sand handed on by one cell as a step of a loop; `params` are the job, the shares [H, W] and what is free.
+
+    With c what is carried, r what cells receive and f what of it rests there, lambda and kappa the cotangents of the height
+    and of what is carried on, and rho = f lambda + (1 - f) kappa where there is room, backwards: (lambda - kappa) r for f,
+    c (rho there - lambda here) for the share s of a neighbour with room, and lambda + the sum of s (the same) for c.
+    """
+
+    tape: int = 16
+
+    def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
+        return pass_on(*params, *state)
+
+    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+        return self(params, k, state), state
+
+    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+        return Plain(self).push(params, k, record, dparams, dstate)
+
+    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+        job, share, free = params
+        if job.bed.rim is not None or isinstance(free, Hanging) or not share[0].ndim:
+            return Plain(self).pull(params, k, record, cotangent)
+        (h, _, carried), (gain, _, onward) = record, cotangent
+        holds = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
+        room, there = halo(holds, 0.0), halo(holds * (free * gain + (1 - free) * onward), 0.0)
+        received, of_carried, of_share = jnp.zeros_like(h), gain, []
+        for (di, dj), s in zip(EIGHT, share, strict=True):
+            more = at(there, di, dj) - gain * at(room, di, dj)
+            received = received + at(halo(s * carried, 0.0), -di, -dj)
+            of_carried = of_carried + s * more
+            of_share.append(carried * more)
+        of_free = received * holds * (gain - onward)
+        floats = split((jax.tree.map(jnp.zeros_like, job), of_share, of_free))[0]
+        return floats, (gain, None, of_carried)
 
 
 def whole(job: Job, amount: jax.Array) -> jax.Array:

@@ -78,6 +78,11 @@ def stand(cover: jax.Array, bottom: jax.Array) -> Around:
 def fluxes(bed: Bed, around: Nothing | Around | Partial, u: jax.Array) -> Fluxes:
     """What flows over every link of a map with halo at rate 1 (m), towards its first cell; last what drains, if it does."""
     s, gate = (u, None) if isinstance(around, Nothing) else (halo(around.surface(at(u))), around.open)
+    return flows(bed, gate, s)
+
+
+def flows(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
+    """`fluxes` for a surface with halo, behind a gate."""
     flow = _isotropic(bed, gate, s) if bed.neighbours == "isotropic" else _pairwise(bed, gate, s)
     if bed.rim is not None:
         out = _over(bed, bed.rim, at(s)) * _draining_sides(bed.rim)

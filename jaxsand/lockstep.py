@@ -14,7 +14,8 @@ from jax.custom_batching import custom_vmap
 
 Tree = Any
 Done = Callable[[Tree, jax.Array, Tree], jax.Array]
-TAPE = 64  # steps kept at hand for reverse mode; of a longer loop they are restored from a state kept for so many steps
+KEPT = 8  # states of a long loop that the forward pass keeps for reverse mode; then every other one is dropped
+SPARE = 2  # and room for so many more, which are restored between them
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Lanes:
     @property
     def room(self) -> int:
         """How many records the tape holds."""
-        return max(1, min(self.bound, TAPE))
+        return max(1, min(self.bound, self.step.tape))
 
     def over(self, axes: Tree) -> "Lanes":
         """The loop over one more leading axis of the state and of those params whose axis is 0."""
@@ -77,6 +78,7 @@ class _Many:
     """A step over one more leading axis."""
 
     def __init__(self, step: Any, axes: Tree) -> None:
+        self.tape = step.tape
         self.call = jax.vmap(step, in_axes=(axes, None, 0))
         self.recorded = jax.vmap(step.recorded, in_axes=(axes, None, 0))
         self.push = jax.vmap(step.push, in_axes=(axes, None, 0, 0, 0))
@@ -121,7 +123,7 @@ def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
 
 
 def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
-    """`run`, with the records of the last stretch of steps and the state before every stretch."""
+    """`run`, with the records of the last steps and, where there may be more of them, some of the states before."""
 
     def advance(carry: Tree) -> Tree:
         state, k, count, ready, tape = carry
@@ -132,10 +134,16 @@ def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tr
         return state, k, count, ready | loop.ready(params, k, state), tape
 
     def stretch(carry: Tree) -> Tree:
-        carry, saved = carry
-        saved = loop.put(saved, carry[1] // loop.room, carry[0])
-        last = carry[1] + loop.room
-        return lax.while_loop(lambda c: (c[1] < last) & ~jnp.all(c[3]), advance, carry), saved
+        carry, stride, (places, saved) = carry
+        k = carry[1]
+        full = jnp.sum(places >= 0) == KEPT
+        stride = jnp.where(full, 2 * stride, stride)
+        places = jnp.where(places % stride == 0, places, -1)
+        slot = jnp.argmin(places)
+        saved = loop.put(saved, slot, carry[0])
+        places = places.at[slot].set(jnp.where(k % stride == 0, k, -1))
+        carry = lax.while_loop(lambda c: (c[1] < k + loop.room) & ~jnp.all(c[3]), advance, carry)
+        return carry, stride, (places, saved)
 
     zero = jnp.int32(0)
     ready = loop.ready(params, zero, state)
@@ -144,9 +152,13 @@ def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tr
     if loop.bound <= loop.room:
         state, _, count, _, tape = lax.while_loop(lambda c: ~jnp.all(c[3]), advance, carry)
         return state, loop.taken(count), tape, ()
-    saved = loop.blank(-(-loop.bound // loop.room), state)
-    (state, _, count, _, tape), saved = lax.while_loop(lambda c: ~jnp.all(c[0][3]), stretch, (carry, saved))
-    return state, loop.taken(count), tape, saved
+    slots = min(-(-loop.bound // loop.room), KEPT + SPARE)
+    memory = (jnp.full(slots, -1, jnp.int32), loop.blank(slots, state))
+    (state, _, count, _, tape), _, (places, saved) = lax.while_loop(
+        lambda c: ~jnp.all(c[0][3]), stretch, (carry, jnp.int32(loop.room), memory)
+    )
+    places = jnp.broadcast_to(places, (*jax.tree.leaves(state)[0].shape[: loop.lanes], slots))
+    return state, loop.taken(count), tape, (places, saved)
 
 
 def push(loop: Lanes, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
@@ -159,37 +171,48 @@ def push(loop: Lanes, params: Tree, state: Tree, count: jax.Array, dparams: Tree
     return lax.fori_loop(0, loop.total(count), push, (state, dstate))[1]
 
 
-def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, saved: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+    """The cotangents of params and of the state at the start, from the end backwards.
+
+    Records that are no longer on the tape are restored from the last state kept before them; where that lies far back, a
+    state halfway is kept first, as long as there is room for one.
+    """
     total = loop.total(count)
 
-    def pull(first: jax.Array, steps: jax.Array, tape: Tree, carry: Tree) -> Tree:
+    def pull(first: jax.Array, end: jax.Array, tape: Tree, carry: Tree) -> Tree:
         def one(j: jax.Array, carry: Tree) -> Tree:
-            j = steps - 1 - j
-            k = first + j
-            cf, cx = carry
-            df, dx = loop.step.pull(params, k, loop.get(tape, j), cx)
-            return loop.keep(loop.beyond(k, count), carry, (jax.tree.map(jnp.add, cf, df), dx))
+            # The record is part of what is carried: XLA would fetch it anew for all that uses it.
+            (cf, cx), record = carry
+            k = end - 1 - j
+            df, dx = loop.step.pull(params, k, record, cx)
+            carry = loop.keep(loop.beyond(k, count), (cf, cx), (jax.tree.map(jnp.add, cf, df), dx))
+            return carry, loop.get(tape, (k - 1) % loop.room)
 
-        return lax.fori_loop(0, steps, one, carry)
+        return lax.fori_loop(0, end - first, one, (carry, loop.get(tape, (end - 1) % loop.room)))[0]
 
     floats = jax.eval_shape(loop.step.pull, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
     carry = (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), floats), cotangent)
     if loop.bound <= loop.room:
         return pull(jnp.int32(0), total, tape, carry)
 
-    def restore(first: jax.Array, tape: Tree) -> Tree:
-        def one(j: jax.Array, c: Tree) -> Tree:
-            new, record = loop.step.recorded(params, first + j, c[0])
-            return loop.keep(loop.beyond(first + j, count), c[0], new), loop.put(c[1], j, record)
+    def again(k: jax.Array, c: Tree) -> Tree:
+        new, record = loop.step.recorded(params, k, c[0])
+        return loop.keep(loop.beyond(k, count), c[0], new), loop.put(c[1], k % loop.room, record)
 
-        steps = jnp.where(first < 0, 0, loop.room)
-        return lax.fori_loop(0, steps, one, (loop.get(saved, jnp.maximum(first, 0) // loop.room), tape))[1]
+    def stretch(c: Tree) -> Tree:
+        end, fresh, places, saved, tape, carry = c
+        before = jnp.where(places < end, places, -1)
+        slot, place, free = jnp.argmax(before), jnp.max(before), jnp.argmin(places)
+        gap = end - place
+        halve = ~fresh & (gap > loop.room) & (places[free] < 0)
+        goal = jnp.where(halve, place + loop.room * ((gap + 2 * loop.room - 1) // (2 * loop.room)), end)
+        state, tape = lax.fori_loop(jnp.where(fresh, goal, place), goal, again, (loop.get(saved, slot), tape))
+        saved = lax.fori_loop(0, halve.astype(jnp.int32), lambda _, saved: loop.put(saved, free, state), saved)
+        places = places.at[free].set(jnp.where(halve, goal, places[free]))
+        first = jnp.where(halve, end, jnp.maximum(end - loop.room, jnp.where(fresh, 0, place)))
+        carry = pull(first, end, tape, carry)
+        return first, jnp.zeros((), bool), jnp.where(places < first, places, -1), saved, tape, carry
 
-    def stretch(i: jax.Array, carry: Tree) -> Tree:
-        tape, carry = carry
-        first = (stretches - 1 - i) * loop.room
-        carry = pull(first, jnp.minimum(loop.room, total - first), tape, carry)
-        return restore(first - loop.room, tape), carry
-
-    stretches = (total + loop.room - 1) // loop.room
-    return lax.fori_loop(0, stretches, stretch, (tape, carry))[1]
+    places, saved = memory
+    start = (total, jnp.ones((), bool), places.reshape(-1, places.shape[-1])[0], saved, tape, carry)
+    return lax.while_loop(lambda c: c[0] > 0, stretch, start)[-1]

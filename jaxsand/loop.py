@@ -26,6 +26,10 @@ class Step(Protocol):
     All of these are pure, and none closes over traced values.
     """
 
+    @property
+    def tape(self) -> int:
+        """How many records are kept at hand; of a longer loop the earlier ones are restored."""
+
     def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree: ...
 
     def recorded(self, params: Tree, k: jax.Array, state: Tree) -> tuple[Tree, Tree]:
@@ -43,6 +47,7 @@ class Plain:
     """A step that leaves the state before it on the tape, and is differentiated there by JAX."""
 
     body: Callable[[Tree, jax.Array, Tree], Tree]
+    tape: int = 16
 
     def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree:
         return self.body(params, k, state)
@@ -83,9 +88,10 @@ def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) 
     last state and the number of steps taken.
 
     Differentiable once, in both modes, with respect to the floats of `params` and `state`, the number of steps held fixed.
-    Forward mode repeats the primal steps. Reverse mode keeps what the last `lockstep.TAPE` steps recorded and a state for
-    every so many steps of the bound; in loops that turn out longer than that it restores the earlier records, which costs
-    one more forward pass. A second derivative raises NotImplementedError.
+    Forward mode repeats the primal steps. Reverse mode keeps what the last `step.tape` steps recorded and, whatever the
+    bound, up to `lockstep.KEPT` states; from these it restores the earlier records of longer loops, which costs about one
+    more forward pass, and half of one more for each doubling beyond `KEPT` tapes. A second derivative raises
+    NotImplementedError.
     """
     return _loop(lockstep.Lanes(done, step, bound, 0), params, state)
 

@@ -18,14 +18,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.advance import Advance
 from jaxsand.bed import Lost
-from jaxsand.displace import Job, contact, pass_on, radial, settle_around, shares, spread, take
-from jaxsand.legs import Pushed, State, along_legs, over_the_map
-from jaxsand.loop import Plain, repeat_until
+from jaxsand.displace import Job, contact, radial, settle_around, spread, take
+from jaxsand.legs import Pushed, State, along_legs, in_window, over_the_map
+from jaxsand.loop import repeat_until
 from jaxsand.scene import Scene
 from jaxsand.sweep import Flow
 from jaxsand.tool import Pose, coverage
-from jaxsand.window import Window, cut, edge_movement, origin, paste
 
 
 @jax.tree_util.register_dataclass
@@ -60,47 +60,13 @@ def _leg(scene: Scene, push: SteppedPush, job: Job, pose: Pose, length: jax.Arra
     # make_scene holds the thickness below the map's diagonal, so twice the diagonal is enough.
     bound = math.ceil((2 * math.hypot(*scene.grid.shape) + 3) / push.substep)
     params = (scene, job, start, length)
-    state, _ = repeat_until(partial(arrived, push), Plain(partial(_advance, push)), bound, params, state)
+    state, _ = repeat_until(partial(arrived, push), Advance(push.substep, push.sweeps), bound, params, state)
     return state
 
 
 def arrived(push: SteppedPush, params: Any, k: jax.Array, _: Any) -> jax.Array:
     _, job, _, length = params
     return k * push.substep * job.bed.spacing >= length
-
-
-def step_ahead(
-    push: SteppedPush, job: Job, start: Pose, length: jax.Array, k: jax.Array
-) -> tuple[Pose, Pose, jax.Array, jax.Array]:
-    """The poses before and after sub-step k of a leg, the way between (m), and which part of a whole sub-step that is."""
-    substep = push.substep * job.bed.spacing
-    begin = k * substep
-    ahead = jnp.minimum(substep, length - begin)
-    pose = Pose(start.x + begin * start.cos, start.y + begin * start.sin, start.cos, start.sin)
-    return pose, Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin), ahead, ahead / substep
-
-
-def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> State:
-    """One sub-step: the blade clears what it newly covers to the front, and the sand settles around it."""
-    scene, job, start, length = params
-    pose, end, ahead, part = step_ahead(push, job, start, length, k)
-
-    def move(job: Job, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost, jax.Array]:
-        # A hair less than what was covered, lest a rounded pose leave a hair of sand in the blade.
-        before = coverage(job.tool, pose, job.x, job.y, job.bed.spacing, -1e-3 * job.bed.spacing)
-        swept = coverage(job.tool, pose, job.x, job.y, job.bed.spacing, ahead)
-        among = contact(job, swept, h)
-        h, carried = take(job, h, before, swept)
-        straight = jnp.maximum(jnp.abs(pose.cos), jnp.abs(pose.sin))
-        share = shares(pose.cos / straight, pose.sin / straight)
-        for _ in range(2):
-            h, lost, carried = pass_on(job, share, 1 - swept, h, lost, carried)
-        after = coverage(job.tool, end, job.x, job.y, job.bed.spacing)
-        flow = Flow(job.flow.rate * (among * part), job.flow.quantum)
-        h, lost = settle_around(job, flow, push.sweeps, after, h + carried, lost)
-        return h, lost, swept
-
-    return in_window(scene, job, pose, state, move)
 
 
 def _lower(scene: Scene, push: SteppedPush, job: Job, pose: Pose, before: Pose | None, state: State) -> State:
@@ -118,17 +84,3 @@ def _lower(scene: Scene, push: SteppedPush, job: Job, pose: Pose, before: Pose |
         return h, lost, cover
 
     return in_window(scene, job, pose, state, move)
-
-
-def in_window(scene: Scene, job: Job, pose: Pose, state: State, move: Callable) -> State:
-    """Applies `move` to the whole map, or to the block of it around the tool."""
-    h, lost, moved = state
-    if not isinstance(scene.window, Window):
-        h, lost, _ = move(job, h, lost)
-        return h, lost, moved
-    window, shape, dx = scene.window, scene.grid.shape, job.bed.spacing
-    start = origin(window, shape, (pose.y / dx, pose.x / dx))
-    old, old_lost = cut(window, shape, start, (h, lost))
-    new, new_lost, cover = move(cut(window, shape, start, job), old, old_lost)
-    moved = jnp.maximum(moved, edge_movement(window, shape, start, old, new, cover) / dx)
-    return paste(start, h, new), paste(start, lost, new_lost), moved

@@ -23,12 +23,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.advance import step_ahead
 from jaxsand.bed import Lost
 from jaxsand.displace import Hanging, Job, Shares, contact, outwards, pass_on, settle_around, shares, spread, whole
 from jaxsand.flux import NARROW
-from jaxsand.legs import Pushed, State, along_legs, over_the_map
+from jaxsand.legs import Pushed, State, along_legs, in_window, over_the_map
 from jaxsand.loop import Plain, repeat_until
-from jaxsand.push import SteppedPush, arrived, in_window, step_ahead
+from jaxsand.push import SteppedPush, arrived
 from jaxsand.scene import Scene
 from jaxsand.swath import complete
 from jaxsand.sweep import Flow
@@ -56,7 +57,7 @@ def roll_along(
 def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> State:
     """One sub-step: what comes to lie above the rim leaves ahead, and the sand settles around the wheel."""
     scene, job, start, length = params
-    pose, end, ahead, part = step_ahead(push, job, start, length, k)
+    pose, end, ahead, part = step_ahead(push.substep, job, start, length, k)
 
     def move(job: Job, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost, jax.Array]:
         now = _over(job, end)

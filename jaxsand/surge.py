@@ -25,6 +25,7 @@ class Surges:
 
     plan: Schedule
     interval: int
+    tape: int = 16
 
     def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
         bed, around, _ = params

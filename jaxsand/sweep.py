@@ -27,9 +27,13 @@ def sweep(bed: Bed, flow: Flow, around: Nothing | Around | Partial, u: jax.Array
 
     `lost` gathers the height that left each cell over a draining rim (see `lose`); None where nothing drains.
     """
+    return apply(bed, flow, counted(flow, fluxes(bed, around, u)), u, lost)
+
+
+def counted(flow: Flow, driven: Fluxes) -> Fluxes:
+    """The whole quanta that cross the links for the fluxes at rate 1."""
     scale = flow.rate / flow.quantum
-    moved = lax.optimization_barrier(tuple(truncate(f * scale) for f in fluxes(bed, around, u)))
-    return apply(bed, flow, moved, u, lost)
+    return lax.optimization_barrier(tuple(truncate(f * scale) for f in driven))
 
 
 def surge(
@@ -60,36 +64,26 @@ class Sweep(Plain):
     def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
         """By hand where sand flows in pairs: from the heights, which tell the links that were active."""
         bed, flow, around = params
-        if bed.neighbours == "isotropic" or bed.rim is not None:
+        if bed.neighbours == "isotropic" or bed.rim is not None or isinstance(around, Around):
             return super().pull(params, k, record, cotangent)
         h, gain = at(record[0]), at(cotangent[0])
         s = record[0] if isinstance(around, Nothing) else halo(around.surface(h))
         gate = None if isinstance(around, Nothing) else around.open
         d, m, weights = adjoint.steps(bed, s), adjoint.yields(bed), adjoint.opened(bed, gate)
-        lengths = adjoint.opened(bed, None)
         back = adjoint.steps(bed, halo(gain, 0.0))
-        onward, of_yield, of_rate, of_gate = [], [], [], []
-        for step, most, w, v, y in zip(d, m, weights, lengths, back, strict=True):
+        onward, of_yield, of_rate = [], [], []
+        for step, most, w, y in zip(d, m, weights, back, strict=True):
             up, down = step > most, step < -most
             pulled = flow.rate * w * y
             onward.append(jnp.where(up | down, pulled, 0))
             of_yield.append(jnp.where(up, pulled, jnp.where(down, -pulled, 0)))
             excess = jnp.where(up, step - most, jnp.where(down, step + most, 0)) * y
             of_rate.append(excess * w)
-            of_gate.append(excess * (v * flow.rate))
         slope = adjoint.gains(bed, lax.optimization_barrier(tuple(onward)))
         dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
         dbed = replace(dbed, drop=adjoint.drop_cotangent(bed, of_yield))
         dflow = replace(dflow, rate=-jnp.sum(sum(of_rate)))
-        if isinstance(around, Around):
-            above = h > around.bottom
-            daround = Around(
-                -adjoint.to_less_open(bed, around.open, of_gate),
-                jnp.where(above, slope * (h - around.bottom), 0),
-                -adjoint.to_shape(jnp.where(above, slope * around.stretch, 0), around.bottom),
-            )
-            slope = slope * (1 + jnp.where(above, around.stretch, 0))
-        elif isinstance(around, Partial):
+        if isinstance(around, Partial):
             share = at(around.open)
             slope = slope / jnp.where(share > 0, share, 1)
         return split((dbed, dflow, daround))[0], (halo(gain + slope, 0.0), None)

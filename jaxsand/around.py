@@ -1,0 +1,144 @@
+"""Sweeps around a tool that stands in the sand, and their derivative: what a sub-step of a push keeps and pulls back.
+
+For the surface s of each sweep, D its steps over the links, e the excess of those over repose, g how open a link is and l
+its length, a sweep moves h by G (rate g e / l); see adjoint.py. With y = D lambda, summed over the sweeps,
+
+    E = sum of e y        gives  -rate E / l  for g  and  -sum of g E / l  for the rate,
+    M = sum of sigma g y  gives  rate M       for the largest stable step of a straight link.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxsand import adjoint
+from jaxsand.bed import Bed, Lost, at, halo
+from jaxsand.flux import Around, flows
+from jaxsand.grid import links
+from jaxsand.loop import Plain, repeat, split
+from jaxsand.sweep import Flow, Sweep, apply, counted
+
+
+@dataclass(frozen=True)
+class Beside:
+    """So many sweeps around a tool as one step of a loop; `params` are the bed, the flow and the tool that stands there."""
+
+    sweeps: int
+    tape: int = 1
+
+    def __call__(self, params: Any, k: jax.Array, state: tuple[jax.Array, Lost]) -> tuple[jax.Array, Lost]:
+        h, lost = state
+        u, lost = repeat(Sweep(), self.sweeps, params, (halo(h), lost))
+        return at(u), lost
+
+    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+        return self(params, k, state), state
+
+    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+        return Plain(self).push(params, k, record, dparams, dstate)
+
+    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+        bed, flow, around = params
+        if not by_hand(bed) or not self.sweeps:
+            return Plain(self).pull(params, k, record, cotangent)
+        of = pull(bed, flow, around, surfaces(bed, flow, around, self.sweeps, record[0]), cotangent[0])
+        dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
+        daround = replace(daround, open=halo(of.open, 0.0), stretch=of.stretch, bottom=of.bottom)
+        dparams = (replace(dbed, drop=of.drop), replace(dflow, rate=of.rate), daround)
+        return split(dparams)[0], (of.height, None)
+
+
+def by_hand(bed: Bed) -> bool:
+    """Whether the derivatives here hold: sand flows in pairs and over no rim."""
+    return bed.neighbours != "isotropic" and bed.rim is None
+
+
+@dataclass(frozen=True)
+class Pulled:
+    """Cotangents of a height [H, W] before some sweeps, of the tool's `open` share, `stretch` and `bottom`, of the sweeps'
+    `rate` and of the bed's `drop`."""
+
+    height: jax.Array
+    open: jax.Array
+    stretch: jax.Array
+    bottom: jax.Array
+    rate: jax.Array
+    drop: jax.Array
+
+
+def surfaces(bed: Bed, flow: Flow, around: Around, sweeps: int, height: jax.Array) -> jax.Array:
+    """The surface before each sweep."""
+
+    def surface(u: jax.Array) -> jax.Array:
+        return halo(around.surface(at(u)))
+
+    def again(i: jax.Array, kept: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        u, tape = kept
+        s = surface(u)
+        moved = counted(flow, flows(bed, around.open, s))
+        return apply(bed, flow, moved, u, None)[0], lax.dynamic_update_index_in_dim(tape, at(s), i, 0)
+
+    tape = jnp.zeros((sweeps, *height.shape), height.dtype)
+    u, tape = lax.fori_loop(0, sweeps - 1, again, (halo(height), tape))
+    return lax.dynamic_update_index_in_dim(tape, at(surface(u)), sweeps - 1, 0)
+
+
+def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.Array) -> Pulled:
+    """What the cotangent [H, W] of the height after the sweeps tells of everything before them."""
+    sweeps = tape.shape[0]
+    gates = [jnp.minimum(here, there) for here, there in adjoint.pairs(bed, around.open)]
+    lengths = [length for _, _, length in links(bed.neighbours)]
+    most = adjoint.yields(bed)
+    per_cell = bool(bed.drop.ndim)
+
+    def stage(j: jax.Array, carry: tuple) -> tuple:
+        gain, excess, tilt, lift, moved = carry
+        s = halo(lax.dynamic_index_in_dim(tape, sweeps - 1 - j, keepdims=False))
+        rises = adjoint.steps(bed, s)
+        passed = adjoint.stored(
+            [
+                jnp.where(jnp.abs(d) > m, y, 0)
+                for d, m, y in zip(rises, most, adjoint.steps(bed, halo(gain, 0.0)), strict=True)
+            ]
+        )
+        beyond = [jnp.where(jnp.abs(d) > m, d - jnp.copysign(m, d), 0) for d, m in zip(rises, most, strict=True)]
+        excess = [e + x * y for e, x, y in zip(excess, beyond, passed, strict=True)]
+        signed = [jnp.copysign(y, y * d) for d, y in zip(rises, passed, strict=True)]
+        if per_cell:
+            tilt = [t + x for t, x in zip(tilt, signed, strict=True)]
+        else:
+            tilt = [tilt[0] + sum(g * x for g, x in zip(gates, signed, strict=True))]
+        onward = tuple(g * (y / length) for g, y, length in zip(gates, passed, lengths, strict=True))
+        slope = at(halo(flow.rate * adjoint.gains(bed, onward), 0.0))
+        rise = at(s) - around.bottom
+        raised = jnp.where(rise > 0, slope, 0)
+        return (
+            gain + slope + raised * around.stretch,
+            excess,
+            tilt,
+            lift + raised,
+            moved + jnp.where(rise > 0, slope * rise, 0),
+        )
+
+    none = jnp.zeros_like(gates[0])
+    nothing = jnp.zeros_like(cotangent)
+    carry = (cotangent, [none] * len(gates), [none] * (len(gates) if per_cell else 1), nothing, nothing)
+    gain, excess, tilt, lift, moved = lax.fori_loop(0, sweeps, stage, carry)
+    per_length = [e / length for e, length in zip(excess, lengths, strict=True)]
+    if per_cell:
+        drop = adjoint.drop_cotangent(
+            bed, [flow.rate * g / length * t for g, length, t in zip(gates, lengths, tilt, strict=True)]
+        )
+    else:
+        drop = flow.rate * adjoint.total(tilt[0])
+    return Pulled(
+        gain,
+        -flow.rate * at(adjoint.to_less_open(bed, around.open, per_length)),
+        moved / (1 + around.stretch),
+        -adjoint.to_shape(lift * around.stretch, around.bottom),
+        -adjoint.total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
+        drop,
+    )
