@@ -9,7 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.gradcheck import SPACING, Case, Inputs, differentiated, errors, inputs, program, relative
+from jaxsand.gradcheck import (
+    SPACING,
+    Case,
+    Inputs,
+    against_differences,
+    differentiated,
+    inputs,
+    of_float32,
+    program,
+    relative,
+)
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Stop, Sweeps, UntilStill
 from jaxsand.scene import cast, make_scene
@@ -32,26 +42,25 @@ def bench_grad(
     tell: Tell = lambda _: None,
     larger: int | None = None,
     cases: tuple[Case, ...] = CASES,
-    points: int = 64,
+    stops: tuple[Stop, ...] = STOPS,
+    plans: tuple[int, ...] = (4, 16, 64),
+    cells: int = 32,
+    batch: int = 64,
     rounds: int = _ROUNDS,
 ) -> dict[str, list[Row]]:
-    """Costs on 64 maps of 32 x 32; with `larger` also on so many of these, and on a 64th as many of 160 x 160. Errors, and
-    errors against run time; and what strokeloss.GRADIENT stands for."""
-    sizes = ((32, 64),) + (((32, larger), (160, max(1, larger // 64))) if larger else ())
+    """Costs, errors, errors against run time when settling stops early, and what strokeloss.GRADIENT stands for, on `batch`
+    maps of `cells` a side. With `larger`, costs also on so many of these, and on a 64th as many of 160 x 160."""
+    sizes = ((cells, batch),) + (((cells, larger), (160, max(1, larger // 64))) if larger else ())
+    early = tuple(case for case in cases if case in (Case(False), Case(True)))
     return {
         "gradient_cost": costs(tell, cases, sizes, rounds),
-        "gradient_error": accuracy(tell, cases, points),
-        "gradient_stopped_early": stopped_early(tell, rounds=rounds),
-        "gradient_of_plans": multiples(tell, rounds=rounds),
+        "gradient_of_plans": multiples(tell, plans, cells=cells, rounds=rounds),
+        "gradient_stopped_early": stopped_early(tell, early, stops, cells, batch, rounds),
+        "gradient_error": accuracy(tell, cases, batch, cells),
     }
 
 
-def costs(
-    tell: Tell = lambda _: None,
-    cases: tuple[Case, ...] = CASES,
-    sizes: tuple[tuple[int, int], ...] = ((32, 64),),
-    rounds: int = _ROUNDS,
-) -> list[Row]:
+def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...], rounds: int = _ROUNDS) -> list[Row]:
     """Run times of the gradient and of the forward run (best of a few, in turns) for maps of so many cells a side, in
     batches of so many, float32; and the memory that the gradient needs beyond the forward run's, in bytes for each cell, and
     for each cell and each of the sweeps that were taken (by the slowest map) or that the stop rule allows."""
@@ -115,29 +124,25 @@ def _sweeps(case: Case, cells: int, strokes: np.ndarray, settling: int) -> tuple
     return taken, allowed
 
 
-def accuracy(tell: Tell = lambda _: None, cases: tuple[Case, ...] = CASES, points: int = 64) -> list[Row]:
+def accuracy(tell: Tell, cases: tuple[Case, ...], points: int, cells: int) -> list[Row]:
     """Errors over the gradient's norm: of float64 by each input against central differences where the points are smooth (see
     gradcheck.py), of which `smooth` is the share, and of float32 against float64."""
     rows = []
     for case in cases:
         tell(f"error: {case.name}")
-        found = errors(case, points)
-        row: Row = {"name": case.name, "points": points, "smooth": float(found.smooth.mean())}
-        for name, error, smooth in zip(("height", "stroke", "angle"), found.float64, found.smooth, strict=True):
-            row[f"largest_by_{name}"] = float(error[smooth].max()) if smooth.any() else None
-        row["float64_median"] = float(np.median(found.float64[found.smooth])) if found.smooth.any() else None
-        row["float32_median"], row["float32_largest"] = float(np.median(found.float32)), float(found.float32.max())
+        error, smooth = against_differences(case, points, cells=cells)
+        single = of_float32(case, points, cells=cells)
+        row: Row = {"name": case.name, "points": points, "smooth": float(smooth.mean())}
+        for k, name in enumerate(("height", "stroke", "angle")):
+            row[f"largest_by_{name}"] = float(error[k][smooth[k]].max(initial=0))
+        row["float64_median"] = float(np.median(error[smooth])) if smooth.any() else None
+        row["float32_median"], row["float32_largest"] = float(np.median(single)), float(single.max())
         rows.append(row)
     return rows
 
 
 def stopped_early(
-    tell: Tell = lambda _: None,
-    cases: tuple[Case, ...] = (Case(False), Case(True)),
-    stops: tuple[Stop, ...] = STOPS,
-    cells: int = 32,
-    batch: int = 64,
-    rounds: int = _ROUNDS,
+    tell: Tell, cases: tuple[Case, ...], stops: tuple[Stop, ...], cells: int, batch: int, rounds: int = _ROUNDS
 ) -> list[Row]:
     """Run times of the gradient in float32 when settling stops early, and its error over its norm, against that in float64
     with a tolerance of 1e-5."""
@@ -181,17 +186,15 @@ def _stopping(run: Callable, stop: Stop, x: Inputs) -> tuple[Callable, Callable]
     return lambda: gradient(*x), lambda: forward(*x)
 
 
-def multiples(
-    tell: Tell = lambda _: None, plans: tuple[int, ...] = (4, 16, 64), strokes: int = 3, rounds: int = _ROUNDS
-) -> list[Row]:
+def multiples(tell: Tell, plans: tuple[int, ...], strokes: int = 3, cells: int = 32, rounds: int = _ROUNDS) -> list[Row]:
     """Times the way forward that the way back takes in `SandLoss.gradient`, for plans of random strokes on level sand; best
     of a few. `counted` is what a search is charged for it."""
-    level = np.zeros((32, 32), np.float32)
+    level = np.zeros((cells, cells), np.float32)
     loss = SandLoss(make_scene(level.shape, SPACING, tool=Blade()), level, level)
     rows = []
     for count in plans:
         tell(f"{count} plans of {strokes} strokes")
-        some = np.random.default_rng(0).uniform(0.06, 0.26, (count, strokes, 4))
+        some = np.random.default_rng(0).uniform(0.2, 0.8, (count, strokes, 4)) * cells * SPACING
         forward = backward = math.inf
         for turn in range(rounds + 1):
             middle = 0.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsand.grid import Neighbours
 from jaxsand.rules import Stop, Sweeps
-from jaxsand.scene import make_scene
+from jaxsand.scene import cast, make_scene
 from jaxsand.settling import settle
 from jaxsand.sim import act, step
 from jaxsand.tool import Blade
@@ -86,61 +86,60 @@ def inputs(case: Case, cells: int, batch: int, seed: int = 0) -> Inputs:
 
 
 def _pushed(heights: np.ndarray, strokes: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    def one(height: Any, stroke: Any, angle: Any) -> Any:
-        return act(make_scene(height.shape, SPACING, angle, tool=Blade()), height, stroke).height
-
     with jax.enable_x64(True):
-        return np.asarray(jax.jit(jax.vmap(one))(*map(jnp.asarray, (heights, strokes, angles))))
+        return np.asarray(_act_program()(*cast((heights, strokes, angles), jnp.float64)))
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Of gradients at random points, over the gradient's norm there: by each input, against central differences in float64
-    [3, P], and which of these points are `smooth` [3, P]; and of float32 against float64 [P]."""
+def against_differences(
+    case: Case, points: int = 64, seed: int = 0, cells: int = 32, chunk: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors [3, P] of the gradient by each input against central differences at random points, in float64 and over the
+    gradient's norm; and which of these points are smooth [3, P].
 
-    float64: np.ndarray
-    smooth: np.ndarray
-    float32: np.ndarray
-
-
-def errors(case: Case, points: int = 64, seed: int = 0, cells: int = 32, chunk: int = 64) -> Errors:
-    """Differences are taken in a normally distributed direction of one input at a time, so that the error is what the
+    Differences are taken in a normally distributed direction of one input at a time, so that the error is what the
     gradient by that input is off by, in the mean square. Lengths count in spacings, angles in rad.
 
-    Kinks are kept away from without asking the gradient: of a few steps the one is taken at which the two one-sided
-    differences agree best, and a point is smooth if these are at most `APART` apart (a kink between the two ends shifts the
-    central difference by half of that) and settling takes the same number of sweeps at both ends and in the middle.
+    Kinks are kept away from, and of the gradient no more is asked than its norm: of a few steps the one is taken at which
+    the one-sided differences agree best, and a point is smooth if these are at most `APART` apart (a kink between the two
+    ends shifts the central difference by half of that) and settling takes the same number of sweeps there and at both ends.
     """
-    parts = [_errors(case, inputs(case, cells, chunk, seed + 1000 * k), cells, seed + k) for k in range(-(-points // chunk))]
-    joined = [
-        np.concatenate([getattr(p, name) for p in parts], -1)[..., :points] for name in ("float64", "smooth", "float32")
-    ]
-    return Errors(*joined)
+    chunk = chunk or points
+    parts = [_differences(case, cells, chunk, seed + 1000 * k) for k in range(-(-points // chunk))]
+    error, smooth = (np.concatenate(both, -1)[:, :points] for both in zip(*parts, strict=True))
+    return error, smooth
 
 
-def _errors(case: Case, given: Inputs, cells: int, seed: int) -> Errors:
-    rng = np.random.default_rng(seed)
-    _, single = _gradient(case, cells)(*(jnp.asarray(v, jnp.float32) for v in given))
+def _differences(case: Case, cells: int, batch: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng, given = np.random.default_rng(seed), inputs(case, cells, batch, seed)
     with jax.enable_x64(True):
-        x = [jnp.asarray(v, jnp.float64) for v in given]
+        x = cast(given, jnp.float64)
         (value, sweeps), gradient = _gradient(case, cells)(*x)
         norm = np.sqrt(_dot(gradient, gradient))
         error, smooth = [], []
-        for k in range(3):
+        for k, unit in enumerate(_UNITS):
             way = rng.standard_normal(x[k].shape)
-            apart, central = np.full(len(norm), np.inf), np.zeros(len(norm))
-            for step_ in STEPS:
+            apart, central = np.full(batch, np.inf), np.zeros(batch)
+            for size in STEPS:
                 (up, n), (down, m) = (
-                    _forward(case, cells)(*x[:k], x[k] + sign * step_ * _UNITS[k] * way, *x[k + 1 :]) for sign in (1, -1)
+                    _forward(case, cells)(*x[:k], x[k] + sign * size * unit * way, *x[k + 1 :]) for sign in (1, -1)
                 )
-                now = np.abs(up - 2 * value + down) / (step_ * norm)
+                now = np.abs(up - 2 * value + down) / (size * norm)
                 now = np.where((n == sweeps) & (m == sweeps), now, np.inf)
-                central = np.where(now < apart, (up - down) / (2 * step_), central)
+                central = np.where(now < apart, (up - down) / (2 * size), central)
                 apart = np.minimum(apart, now)
-            own = _UNITS[k] * np.asarray(gradient[k] * way).reshape(len(norm), -1).sum(1)
+            own = unit * np.asarray(gradient[k] * way).reshape(batch, -1).sum(1)
             error.append(np.abs(own - central) / norm)
             smooth.append(apart <= APART)
-    return Errors(np.array(error), np.array(smooth), relative(single, gradient))
+    return np.array(error), np.array(smooth)
+
+
+def of_float32(case: Case, points: int = 64, seed: int = 0, cells: int = 32) -> np.ndarray:
+    """Errors [P] of the gradient in float32 at random points, against that in float64, over its norm."""
+    given = inputs(case, cells, points, seed)
+    single = _gradient(case, cells)(*cast(given, jnp.float32))[1]
+    with jax.enable_x64(True):
+        double = _gradient(case, cells)(*cast(given, jnp.float64))[1]
+        return relative(single, double)
 
 
 def _dot(a: Any, b: Any) -> np.ndarray:
@@ -163,3 +162,11 @@ def _forward(case: Case, cells: int) -> Callable:
 @cache
 def _gradient(case: Case, cells: int) -> Callable:
     return jax.jit(differentiated(program(case, cells)))
+
+
+@cache
+def _act_program() -> Callable:
+    def one(height: Any, stroke: Any, angle: Any) -> Any:
+        return act(make_scene(height.shape, SPACING, angle, tool=Blade()), height, stroke).height
+
+    return jax.jit(jax.vmap(one))
