@@ -30,9 +30,9 @@ class Kind:
     scheme: object = None
 
 
-QUICK = [Kind("blade, 8"), Kind("blade, isotropic, draining", "isotropic", draining=True)]
 KINDS = [
-    *QUICK,
+    Kind("blade, 8"),
+    Kind("blade, isotropic, draining", "isotropic", draining=True),
     Kind("blade, 4, draining", 4, draining=True),
     Kind("blade, 8, window", window=js.Window((8, 8))),
     Kind("blade in closed form", push=js.SwathPush(), scheme=js.Relaxation()),
@@ -125,9 +125,8 @@ def check_finite(kind, count, seed=0, batch=500):
     assert not wrong, "\n".join(map(str, [numbers, *wrong[:5]]))
 
 
-@pytest.mark.parametrize("kind", QUICK, ids=lambda kind: kind.name)
-def test_gradients_are_finite(kind):
-    check_finite(kind, 1500)
+def test_gradients_are_finite_in_2000_cases():
+    check_finite(KINDS[0], 2000)
 
 
 @pytest.mark.slow
