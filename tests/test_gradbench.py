@@ -11,7 +11,6 @@ from jaxsand.benchmark import table
 from jaxsand.gradcheck import Case
 from jaxsand.rules import Sweeps, UntilStill
 
-
 SMALL = (Case(False),)
 
 
