@@ -7,7 +7,6 @@ call less a later one.
 import math
 import os
 import platform
-import string
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,17 +19,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import analysis, complexity, expansions, goals, piles, rutbench, sandbench, stability, strokebench, workprec
+from jaxsand import analysis, complexity, expansions, gradbench, piles, rutbench, sandbench, stability, strokebench, workprec
 from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
+from jaxsand.letterbench import bench_letters
 from jaxsand.plain import compile_c, settle_numpy
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Sweeps, UntilStill
 from jaxsand.scene import Scene, make_scene
 from jaxsand.schemes import Relaxation, SuperTimeStepping
 from jaxsand.settling import Settled, settle, settle_batch
-from jaxsand.shaping import Layout, glyph_target, map_target, shape
 from jaxsand.sim import act, step, step_batch
 from jaxsand.swath import SwathPush
 from jaxsand.tool import Blade
@@ -46,12 +45,14 @@ _C = "C loop, one core"
 
 
 def bench(
-    what: str, batch: int = 4096, tell: Tell = lambda _: None, grids: int = 3, seed: int = 0, out: Path | None = None
+    what: str, batch: int | None = None, tell: Tell = lambda _: None, grids: int = 3, seed: int = 0, out: Path | None = None
 ) -> dict[str, Any]:
-    """The figures for `what`: settle, push, plan, or all of these; sand, strokes, trench, stability, or letters.
+    """The figures for `what`: settle, push, plan, or all of these; grad, sand, strokes, trench, stability, or letters.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
+    `batch` is 4096, for grad 64, unless given.
     """
+    larger, batch = batch, batch or (64 if what == "grad" else 4096)
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
@@ -74,6 +75,8 @@ def bench(
     if what in ("plan", "all"):
         report |= complexity.planning(tell)
         report["expansions"] = expansions.rows_of_expansions(tell)
+    if what == "grad":
+        report |= gradbench.bench_grad(tell, larger)
     if what == "sand":
         report["children"] = sandbench.children_per_second()
         report["sand"] = sandbench.bench_sand(tell, seed=seed)
@@ -210,36 +213,6 @@ def bench_push(batch: int, tell: Tell = lambda _: None, sample: int = 64) -> lis
                 "pushes_per_second": ways[name].maps / seconds,
                 "seconds": seconds,
                 "compile_seconds": max(0.0, first - seconds),
-            }
-        )
-    return rows
-
-
-def bench_letters(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
-    """Every letter by the plan of its map, and by its own strokes.
-
-    A letter pushed by its own strokes is its own goal, so that row checks the plumbing.
-    """
-    rows = []
-    for letter in string.ascii_uppercase:
-        tell(f"letter {letter}")
-        dig, start = goals.letter_map(letter)
-        planned = shape(map_target(dig, start, letter, Layout()))
-        own = shape(glyph_target(goals.letter_strokes(letter), letter))
-        figures = planned.figures
-        rows.append(
-            {
-                "name": letter,
-                "steps": planned.steps,
-                "iou": figures["iou"],
-                "l2_reduction": figures["l2_reduction"],
-                "l2_reduction_with_berms": figures["l2_reduction_with_berms"],
-                "volume_error": figures["volume_error"],
-                "max_slope_deg": figures["max_slope_deg"],
-                "run_seconds": planned.seconds["run"],
-                "own_strokes": own.steps,
-                "own_iou": own.figures["iou"],
-                "own_l2_reduction": own.figures["l2_reduction"],
             }
         )
     return rows

@@ -121,8 +121,9 @@ def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
 
     Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
     """
-    near = jnp.clip(1 + (h - job.bottom) / job.bed.spacing, 0, 1)
-    return jnp.minimum(1, 2 * jnp.max(jnp.max(jnp.where(jnp.isnan(h), 0, near) * cover, axis=0)))
+    above = jnp.where(jnp.isnan(h), -jnp.inf, h) - job.bottom
+    near = jnp.clip(1 + jnp.maximum(above, -job.bed.spacing) / job.bed.spacing, 0, 1)
+    return jnp.minimum(1, 2 * jnp.max(jnp.max(near * cover, axis=0)))
 
 
 def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:

@@ -108,8 +108,8 @@ def _take(job: Job, h: jax.Array, old: Hanging, new: Hanging) -> tuple[jax.Array
 def _settle(job: Job, sweeps: int, wheel: Hanging, part: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
     """Sweeps the sand around the wheel, which keeps it from flowing where it touches it."""
     job = replace(job, bottom=wheel.bottom)
-    touch = jnp.clip(1 + (h - wheel.bottom) / (_TOUCH * job.bed.spacing), 0, 1)
-    touch = jnp.where(jnp.isnan(h), 0, touch)
+    above, reach = jnp.where(jnp.isnan(h), -jnp.inf, h) - wheel.bottom, _TOUCH * job.bed.spacing
+    touch = jnp.clip(1 + jnp.maximum(above, -reach) / reach, 0, 1)
     flow = Flow(job.flow.rate * (contact(job, wheel.cover, h) * part), job.flow.quantum)
     return settle_around(job, flow, sweeps, wheel.cover * touch, h, lost)
 

@@ -1,0 +1,40 @@
+"""Every letter, shaped: how close the sand comes to it."""
+
+import string
+from collections.abc import Callable
+from typing import Any
+
+from jaxsand import goals
+from jaxsand.shaping import Layout, glyph_target, map_target, shape
+
+Tell = Callable[[str], None]
+
+
+def bench_letters(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """Every letter by the plan of its map, and by its own strokes.
+
+    A letter pushed by its own strokes is its own goal, so that row checks the plumbing.
+    """
+    rows = []
+    for letter in string.ascii_uppercase:
+        tell(f"letter {letter}")
+        dig, start = goals.letter_map(letter)
+        planned = shape(map_target(dig, start, letter, Layout()))
+        own = shape(glyph_target(goals.letter_strokes(letter), letter))
+        figures = planned.figures
+        rows.append(
+            {
+                "name": letter,
+                "steps": planned.steps,
+                "iou": figures["iou"],
+                "l2_reduction": figures["l2_reduction"],
+                "l2_reduction_with_berms": figures["l2_reduction_with_berms"],
+                "volume_error": figures["volume_error"],
+                "max_slope_deg": figures["max_slope_deg"],
+                "run_seconds": planned.seconds["run"],
+                "own_strokes": own.steps,
+                "own_iou": own.figures["iou"],
+                "own_l2_reduction": own.figures["l2_reduction"],
+            }
+        )
+    return rows

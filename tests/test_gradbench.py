@@ -1,0 +1,59 @@
+"""The bench of gradients, on a tiny case."""
+
+import json
+import math
+
+import pytest
+
+from jaxsand import gradbench
+from jaxsand.__main__ import main
+from jaxsand.benchmark import table
+from jaxsand.gradcheck import Case
+from jaxsand.rules import Sweeps, UntilStill
+
+SMALL = (Case(False),)
+
+
+@pytest.fixture(scope="module")
+def report():
+    cost, error = gradbench.costs(print, SMALL, ((12, 4),), 1), gradbench.accuracy(print, SMALL, 4, 12)
+    return {"gradient_cost": cost, "gradient_error": error}
+
+
+def check_numbers(report):
+    for rows in report.values():
+        assert rows
+        for row in rows:
+            assert all(isinstance(v, str) or math.isfinite(v) for v in row.values()), row
+
+
+def test_the_figures_make_sense(report):
+    check_numbers(report)
+    (cost,) = report["gradient_cost"]
+    assert cost["bytes_per_cell"] > 0
+    assert cost["bytes_per_cell_and_sweep_allowed"] < cost["bytes_per_cell_and_sweep"]
+    (error,) = report["gradient_error"]
+    assert error["smooth"] > 0.5
+    assert max(error[f"largest_by_{name}"] for name in ("height", "stroke", "angle")) < 1e-4
+    assert error["float32_median"] < 1e-2
+
+
+@pytest.mark.slow
+def test_the_whole_bench():
+    stops = (UntilStill(0.1), Sweeps(16))
+    report = gradbench.bench_grad(print, None, SMALL, stops, (2,), 12, 4, 1)
+    assert list(report) == ["gradient_cost", "gradient_of_plans", "gradient_stopped_early", "gradient_error"]
+    check_numbers(report)
+    assert [row["stop"] for row in report["gradient_stopped_early"]] == ["tolerance 0.1", "16 sweeps"]
+
+
+def test_the_command_prints_them(report, monkeypatch, capsys, tmp_path):
+    larger = []
+    monkeypatch.setattr(gradbench, "bench_grad", lambda tell, batch: larger.append(batch) or report)
+    assert main(["bench", "grad", "--json", "--out", str(tmp_path)]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert set(report) < set(printed)
+    assert (tmp_path / "bench-grad.json").is_file()
+    assert main(["bench", "grad", "--batch", "1024"]) == 0
+    assert larger == [None, 1024]
+    assert "gradient error" in table(printed)
