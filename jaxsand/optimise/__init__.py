@@ -85,6 +85,9 @@ def search(account: Account, strokes: int, rng: np.random.Generator) -> None:
     """Spends the account's budget on plans of so many strokes."""
     mark = print_of(account)
     plans = first(account, mark, strokes, rng)
+    if plans is not None and np.ptp(account.sand.start) > 0:  # prints say little of rough sand
+        felt = moves.stroke_by_stroke(account, strokes, account.room(strokes) * strokes // 2, rng)
+        plans = moves.ranked(np.concatenate([felt[0], plans[0]]), np.concatenate([felt[1], plans[1]]), 1)
     if plans is not None:
         improve(account, mark, plans, rng)
 
