@@ -112,8 +112,8 @@ def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generat
 
 
 def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.Generator) -> Plans:
-    """A plan found on the sand itself, in about so many calls: each stroke is the best of those tried on what the ones before
-    it left. They run from where sand is too high to where it is too low, or anywhere, and then from near the best."""
+    """A plan found on the sand itself, in about so many calls: each stroke is the best of those tried on what earlier ones
+    left. They run from where sand is too high to where it is too low, or anywhere, and then from near the best."""
     sand, low, high = account.sand, *account.sand.bounds
     dx = float(sand.scene.grid.spacing)
     here, plan = sand.start, np.zeros((0, 4))
