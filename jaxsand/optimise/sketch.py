@@ -36,7 +36,8 @@ class Print:
 
 def prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """What strokes [..., 4] (in cells, cell centres at whole numbers and a half) leave of level sand: [..., H, W]."""
-    x, y = jnp.arange(shape[1]) + 0.5, jnp.arange(shape[0])[:, None] + 0.5
+    ahead = (1,) * (strokes.ndim - 1)
+    x, y = jnp.arange(shape[1]).reshape(*ahead, 1, -1) + 0.5, jnp.arange(shape[0]).reshape(*ahead, -1, 1) + 0.5
     x0, y0, x1, y1 = (strokes[..., k, None, None] for k in range(4))
     dx, dy = x1 - x0, y1 - y0
     length = jnp.sqrt(dx * dx + dy * dy + 1e-12)
