@@ -95,7 +95,20 @@ def wheel(names):
     assert all(np.diff(values)[0] > 0 for values in names["pull"].values())
 
 
-CHECKS = {"settling": settling, "planning": planning, "wheel": wheel}
+def strokes(names):
+    """Checks what notebooks/strokes.ipynb says."""
+    assert names["off"] < 1e-5
+    for found in [*names["found"], names["free"], names["levelled"]]:
+        assert np.all(np.diff(found.losses) < 0)
+    assert all(found.losses[-1] < found.losses[0] / 4 for found in names["found"])
+    assert max(names["left"].values()) <= 1
+    degrees = names["degrees"]
+    assert all(int(fit.verdict) == 0 for fit in names["fits"].values())
+    assert all(abs(value - 31) < 4 * error for value, error in degrees.values())
+    assert degrees["both"][1] <= degrees["a collapse"][1] * 1.05 < degrees["a push"][1]
+
+
+CHECKS = {"settling": settling, "planning": planning, "wheel": wheel, "strokes": strokes}
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")  # plt.show() where there is a display

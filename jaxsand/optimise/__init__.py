@@ -83,7 +83,11 @@ def optimise_strokes(
 def search(account: Account, strokes: int | None, rng: np.random.Generator, most: int = 8) -> None:
     """Spends the account's budget on plans of so many strokes, or of as many as pay."""
     mark = print_of(account)
-    plans = first(account, mark, strokes or as_many_as_pay(account, mark, most, rng), rng)
+    count = strokes or as_many_as_pay(account, mark, most, rng)
+    plans = first(account, mark, count, rng)
+    if plans is not None and np.ptp(account.sand.start) > 0:  # prints say little of rough sand
+        felt = moves.stroke_by_stroke(account, count, account.room(count) * count // 2, rng)
+        plans = moves.ranked(np.concatenate([felt[0], plans[0]]), np.concatenate([felt[1], plans[1]]), 1)
     if plans is not None:
         improve(account, mark, plans, rng)
 

@@ -65,6 +65,11 @@ class Account:
         self.calls += len(plans) * plans.shape[1]
         return self.sand.maps(plans)
 
+    def after(self, height: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The losses and the maps after one more stroke of [P, 4] (m) each on a map [H, W]."""
+        self.calls += len(strokes)
+        return self.sand.after(np.repeat(height[None], len(strokes), axis=0), strokes)
+
     def _note(self, plans: np.ndarray, losses: np.ndarray) -> None:
         first = int(np.argmin(losses))
         if np.isfinite(losses[first]) and (not self.history or losses[first] < self.best.loss):

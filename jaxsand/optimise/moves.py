@@ -15,6 +15,7 @@ from jaxsand.optimise.sketch import Print, guesses
 Plans = tuple[np.ndarray, np.ndarray]  # [P, N, 4] (m), closest first, and their losses [P] (m^2)
 _STEPS = (1.0, 0.3, 0.1, 0.03)  # lengths that a quasi-Newton step is tried at
 _MEMORY = 8  # gradients that the quasi-Newton steps remember
+_DRAWN = 32  # strokes that are tried at a time
 _TRIED = 3  # strokes that are tried in the place of one
 
 
@@ -108,6 +109,43 @@ def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generat
         return start
     far = account.losses(np.stack(others))
     return ranked(np.concatenate([plans, others]), np.concatenate([losses, far]), len(plans))
+
+
+def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.Generator) -> Plans:
+    """A plan found on the sand itself, in about so many calls: each stroke is the best of those tried on what earlier ones
+    left. They run from where sand is too high to where it is too low, or anywhere, and then from near the best."""
+    sand, low, high = account.sand, *account.sand.bounds
+    dx = float(sand.scene.grid.spacing)
+    here, plan = sand.start, np.zeros((0, 4))
+    for _ in range(strokes):
+        best, least = np.concatenate([low[:2], low[:2]]), np.inf
+        rounds = max(1, calls // strokes // _DRAWN)
+        for k in range(rounds):
+            if k < max(1, rounds // 3):
+                drawn = _from_high_to_low(here.astype(float) - sand.goal, rng) * dx
+                anywhere = rng.random((_DRAWN, 4)) * (high - low) + low
+                drawn = np.where(rng.random((_DRAWN, 1)) < 0.5, drawn, anywhere)
+            else:
+                drawn = best + rng.normal(0, 1, (_DRAWN, 4)) * np.geomspace(0.3, 6, _DRAWN)[:, None] * dx
+            drawn = _inside(account, drawn)
+            far, maps = account.after(here, drawn)
+            first = int(np.argmin(far))
+            if far[first] < least:
+                best, least, there = drawn[first], float(far[first]), maps[first]
+        if not np.isfinite(least):
+            break
+        here, plan = there, np.concatenate([plan, best[None]])
+    return plan[None], account.losses(plan[None])
+
+
+def _from_high_to_low(off: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Strokes [n, 4] (cells) from where sand is too high to where it is too low, the likelier the more."""
+    ends = []
+    for much in (np.maximum(off, 0), np.maximum(-off, 0)):
+        share = (much + 1e-12).ravel()
+        rows, columns = np.unravel_index(rng.choice(share.size, _DRAWN, p=share / share.sum()), off.shape)
+        ends += [columns, rows]
+    return np.stack(ends, 1) + 0.5
 
 
 def _inside(account: Account, plans: np.ndarray) -> np.ndarray:
