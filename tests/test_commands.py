@@ -95,7 +95,10 @@ BAD = {
     "plan of nothing": (["plan", "none.txt"], "none.txt: no such file"),
     "plan in pieces": (["plan", "apart.txt"], "map: got 2 pieces"),
     "search for a drawn goal": (["shape", "l.txt", "--method", "search"], "method: 'search' compares berms too"),
-    "pushes without a search": (["shape", "L", "--pushes", "9"], "pushes: has an effect with --method search or optimise only"),
+    "pushes without a search": (
+        ["shape", "L", "--pushes", "9"],
+        "pushes: has an effect with --method search or optimise only",
+    ),
     "plan to nowhere": (["plan", "l.txt", "--end", "0,2"], r"end: got \(0, 2\)"),
     "plan to no cell": (["plan", "l.txt", "--end", "here"], "end: got 'here'"),
     "plan in no time": (["plan", "l.txt", "--seconds", "0"], "seconds: got 0.0"),
