@@ -123,8 +123,12 @@ def _bench(commands: Any) -> None:
         "--batch", type=_count, metavar="N", help="maps in a batch (4096; grad: 64, if given larger maps as well)"
     )
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
-    p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of the searches on sand (0)")
-    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the JSON report and its figure")
+    p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of the searches on sand, the first for strokes (0)")
+    p.add_argument("--seeds", type=_count, default=1, metavar="N", help="strokes: how many seeds from that one on (1)")
+    p.add_argument("--calls", type=_count, default=4_000, metavar="N", help="strokes: calls of the simulator (4000)")
+    p.add_argument("--goals", choices=["letters", "turned", "rough", "eight"], default="letters", help="strokes: (letters)")
+    p.add_argument("--methods", metavar="A,B", help="strokes: methods by name (all)")
+    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the report and its figure; strokes goes on there")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_benchmark)
 

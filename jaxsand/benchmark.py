@@ -12,7 +12,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -45,12 +44,17 @@ _C = "C loop, one core"
 
 
 def bench(
-    what: str, batch: int | None = None, tell: Tell = lambda _: None, grids: int = 3, seed: int = 0, out: Path | None = None
+    what: str,
+    batch: int | None = None,
+    tell: Tell = lambda _: None,
+    grids: int = 3,
+    seed: int = 0,
+    **strokes: Any,
 ) -> dict[str, Any]:
     """The figures for `what`: settle, push, plan, or all of these; grad, sand, strokes, trench, stability, or letters.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
-    `batch` is 4096, for grad 64, unless given.
+    `batch` is 4096, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`.
     """
     larger, batch = batch, batch or (64 if what == "grad" else 4096)
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
@@ -81,7 +85,7 @@ def bench(
         report["children"] = sandbench.children_per_second()
         report["sand"] = sandbench.bench_sand(tell, seed=seed)
     if what == "strokes":
-        report |= strokebench.bench_strokes(tell, seed, out)
+        report |= strokebench.bench_strokes(tell, **strokes)
     if what == "trench":
         report["trench_by_spacing"] = rutbench.against_spacing(tell, grids + 1)
         report["trench_settles"] = rutbench.settling(tell)

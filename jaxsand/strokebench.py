@@ -132,10 +132,11 @@ def run_all(
 ) -> list[Row]:
     """A row for every method, goal and seed: one run at the largest budget, with what it had at each of the others.
 
-    Rows are also written to `out`/strokes.jsonl as they come, and rows that are there already are not computed again.
+    Rows are also written to `out`/strokes.jsonl as they come, and what is there already, or was run with more calls, is not
+    computed again.
     """
     path = out / "strokes.jsonl" if out else None
-    known = {_key(row): row for row in _read(path)} if path else {}
+    known = {_key(row): row for row in sorted(_read(path), key=lambda row: max(row["budgets"]))} if path else {}
     rows = []
     for goal in some:
         for seed in seeds:
@@ -143,12 +144,12 @@ def run_all(
                 tell(f"{goal.name}, seed {seed}: {name}")
                 want = {"method": name, "goal": goal.name, "seed": seed, "strokes": len(goal.strokes), "budgets": [*budgets]}
                 row = known.get(_key(want))
-                if row is None:
+                if row is None or not set(budgets) <= set(row["budgets"]):
                     row = want | run_one(method, goal, budgets, seed)
                     if path:
                         with path.open("a", encoding="utf-8") as file:
                             file.write(json.dumps(row) + "\n")
-                rows.append(row)
+                rows.append(_up_to(row, budgets))
     return rows
 
 
@@ -181,7 +182,7 @@ def reached(rows: list[Row]) -> list[Row]:
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
         names = list(dict.fromkeys(row["goal"] for row in mine))
-        line: Row = {"method": method, "goals": len(names)}
+        line: Row = {"method": method, "goals": len(names), "seeds": len({row["seed"] for row in mine})}
         for k, budget in enumerate(mine[0]["budgets"]):
             ends = {
                 figure: [median(row["at"][k][figure] for row in mine if row["goal"] == name) for name in names]
@@ -190,28 +191,48 @@ def reached(rows: list[Row]) -> list[Row]:
             line[f"reached_at_{budget}"] = sum(iou >= REACHED for iou in ends["iou"])
             line[f"iou_at_{budget}"] = median(ends["iou"])
             line[f"l2_reduction_at_{budget}"] = median(ends["l2_reduction"])
+        line["median_seconds"] = median(row["seconds"] for row in mine)
         out.append(line)
     return out
 
 
+GOALS: dict[str, Callable[[], list[StrokeGoal]]] = {
+    "letters": letters,
+    "turned": turned_letters,
+    "rough": letters_on_rough_sand,
+    "eight": many_strokes,
+}
+
+
 def bench_strokes(
     tell: Tell = lambda _: None,
-    seed: int = 0,
+    goals: str = "letters",
+    calls: int = 4_000,
+    seeds: tuple[int, ...] = (0,),
+    methods: tuple[str, ...] = (),
     out: Path | None = None,
-    methods: dict[str, Method] | None = None,
-    budgets: tuple[int, ...] = BUDGETS[:2],
-    names: str = string.ascii_uppercase,
 ) -> dict[str, list[Row]]:
-    """Every method on letters on level sand, with one seed."""
+    """Methods (all, unless named) on one kind of `GOALS`, with up to so many calls."""
+    unknown = [name for name in methods if name not in METHODS]
+    if unknown:
+        raise ValueError(f"methods: got {', '.join(unknown)}; give some of {', '.join(METHODS)}")
     tell("making the goals")
-    rows = run_all(methods or METHODS, letters(names), budgets, (seed,), out, tell)
+    chosen = {name: METHODS[name] for name in methods or METHODS}
+    budgets = (*(b for b in BUDGETS if b < calls), calls)
+    rows = run_all(chosen, GOALS[goals](), budgets, seeds, out, tell)
     return {"strokes": reached(rows), "strokes_by_goal": [_line(row) for row in rows], "strokes_curves": rows}
 
 
 def _line(row: Row) -> Row:
-    return {"method": row["method"], "goal": row["goal"], "strokes": row["strokes"]} | {
+    return {key: row[key] for key in ("method", "goal", "strokes", "seed")} | {
         f"iou_at_{at['budget']}": at["iou"] for at in row["at"]
     }
+
+
+def _up_to(row: Row, budgets: tuple[int, ...]) -> Row:
+    """What a run had at each of some of its budgets."""
+    curve = [point for point in row["curve"] if point[0] <= max(budgets)]
+    return row | {"budgets": [*budgets], "at": [at for at in row["at"] if at["budget"] in budgets], "curve": curve}
 
 
 def _at(history: list[Best], budget: int) -> Best | None:
@@ -219,7 +240,7 @@ def _at(history: list[Best], budget: int) -> Best | None:
 
 
 def _key(row: Row) -> tuple:
-    return row["method"], row["goal"], row["seed"], row["strokes"], tuple(row["budgets"])
+    return row["method"], row["goal"], row["seed"], row["strokes"]
 
 
 def _read(path: Path) -> list[Row]:

@@ -131,6 +131,9 @@ def test_the_bench_writes_what_it_computes_and_does_not_compute_it_again(bar, tm
         raise AssertionError
 
     assert run_all({"random shooting": never}, [bar], (4, 16), (0, 1), tmp_path) == rows
+    fewer = run_all({"random shooting": never}, [bar], (4,), (0,), tmp_path)[0]
+    assert fewer["at"] == rows[0]["at"][:1]
+    assert fewer["curve"][-1][0] <= 4
     line = reached(rows)[0]
     assert line["method"] == "random shooting"
     assert line["goals"] == 1
@@ -142,17 +145,20 @@ def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch)
     def short(evaluate, n_strokes, bounds, budget, seed):
         return random_shooting(evaluate, n_strokes, bounds, min(budget, 16), seed)
 
-    monkeypatch.setattr(strokebench, "letters", lambda _: [bar])
+    monkeypatch.setitem(strokebench.GOALS, "letters", lambda: [bar])
     monkeypatch.setattr(strokebench, "METHODS", {"random shooting": short})
     assert main(["bench", "strokes", "--out", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert "reached at 4000" in text
-    assert "random shooting bar" in text
+    assert "random shooting" in text
+    assert "bar" in text
     assert {path.name for path in tmp_path.iterdir()} == {"strokes.jsonl", "bench-strokes.json", "bench-strokes.png"}
     assert main(["bench", "strokes", "--out", str(tmp_path), "--seed", "1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["strokes"][0]["goals"] == 1
     assert [row["seed"] for row in report["strokes_curves"]] == [1]
+    assert main(["bench", "strokes", "--methods", "shooting"]) == 2
+    assert "methods: got shooting; give some of random shooting" in capsys.readouterr().err
 
 
 def test_goals_of_other_kinds():

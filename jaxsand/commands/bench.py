@@ -1,6 +1,7 @@
 """`jaxsand bench`: error against run time, and speed beside rivals."""
 
 import argparse
+from typing import Any
 
 from jaxsand.commands.printing import show
 from jaxsand.files import as_json, folder, progress, written
@@ -11,7 +12,8 @@ def run_benchmark(options: argparse.Namespace) -> None:
     out = folder(options.out) if options.out else None
     from jaxsand.benchmark import bench, table
 
-    report = bench(options.what, options.batch, tell, options.grids, options.seed, out)
+    strokes = {} if options.what != "strokes" else _of_strokes(options)
+    report = bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
     if out:
         from jaxsand.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
 
@@ -37,3 +39,13 @@ def run_benchmark(options: argparse.Namespace) -> None:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     show(options, report, table)
+
+
+def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
+    return {
+        "goals": options.goals,
+        "calls": options.calls,
+        "seeds": tuple(range(options.seed, options.seed + options.seeds)),
+        "methods": tuple(options.methods.split(",")) if options.methods else (),
+        "out": options.out,
+    }
