@@ -31,6 +31,7 @@ Tell = Callable[[str], None]
 Row = dict[str, Any]
 STOPS: tuple[Stop, ...] = (*(UntilStill(t) for t in (0.1, 0.03, 0.01, 1e-3, 1e-4)), *(Sweeps(n) for n in (16, 64, 256)))
 _ROUNDS = 3
+_CACHED = 16 * 32 * 32  # cells
 CASES = (
     *(Case(pushes, neighbours) for pushes in (False, True) for neighbours in (4, 8, "isotropic")),
     *(Case(pushes, window=Window((16, 16))) for pushes in (False, True)),
@@ -62,24 +63,28 @@ def bench_grad(
 
 def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...], rounds: int = _ROUNDS) -> list[Row]:
     """Run times of the gradient and of the forward run (best of a few, in turns) for maps of so many cells a side, in
-    batches of so many, float32; and the memory that the gradient needs beyond the forward run's, in bytes for each cell, and
-    for each cell and each of the sweeps that were taken (by the slowest map) or that the stop rule allows."""
+    batches of so many, float32, as many at a time as have 16,384 cells together, so that they stay in a core's cache. And
+    the memory that the gradient needs beyond the forward run's, in bytes for each cell of the maps that run together, and
+    for each of these and each of the sweeps that were taken (by the slowest map) or that the stop rule allows."""
     rows = []
     for cells, batch in sizes:
+        together = min(batch, max(1, _CACHED // cells**2))
         for case in cases:
             tell(f"cost: {case.name}, {batch} maps of {cells} x {cells}")
             given = inputs(case, cells, batch)
             x = cast(given, jnp.float32)
             run = program(case, cells)
-            forward, gradient = _compiled(jax.vmap(run), x), _compiled(differentiated(run), x)
+            slope = jax.value_and_grad(run, (0, 1, 2), has_aux=True)
+            forward, gradient = _compiled(_together(run, together), x), _compiled(_together(slope, together), x)
             best = _race([lambda f=forward, x=x: f[0](*x), lambda f=gradient, x=x: f[0](*x)], rounds)
             taken, allowed = _sweeps(case, cells, given[1], int(jnp.max(forward[0](*x)[1])))
-            more = (gradient[2] - forward[2]) / (batch * cells**2)
+            more = (gradient[2] - forward[2]) / (together * cells**2)
             rows.append(
                 {
                     "name": case.name,
                     "cells": cells,
                     "batch": batch,
+                    "together": together,
                     "forward_seconds": best[0],
                     "gradient_seconds": best[1],
                     "gradient_over_forward": best[1] / best[0],
@@ -92,6 +97,11 @@ def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...
                 }
             )
     return rows
+
+
+def _together(run: Callable, count: int) -> Callable:
+    """`run` of a batch, so many at a time."""
+    return lambda *x: jax.lax.map(lambda one: run(*one), x, batch_size=count)
 
 
 def _compiled(run: Callable, x: Inputs) -> tuple[Any, float, int]:

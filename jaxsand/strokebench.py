@@ -136,7 +136,7 @@ def run_all(
     computed again.
     """
     path = out / "strokes.jsonl" if out else None
-    known = {_key(row): row for row in sorted(_read(path), key=lambda row: max(row["budgets"]))} if path else {}
+    known = _known(path) if path else {}
     rows = []
     for goal in some:
         for seed in seeds:
@@ -181,19 +181,26 @@ def reached(rows: list[Row]) -> list[Row]:
     out = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
-        names = list(dict.fromkeys(row["goal"] for row in mine))
-        line: Row = {"method": method, "goals": len(names), "seeds": len({row["seed"] for row in mine})}
-        for k, budget in enumerate(mine[0]["budgets"]):
-            ends = {
-                figure: [median(row["at"][k][figure] for row in mine if row["goal"] == name) for name in names]
+        line: Row = {"method": method, "goals": len({row["goal"] for row in mine})}
+        for budget in sorted({budget for row in mine for budget in row["budgets"]}):
+            ends = at_budget(mine, budget)
+            names = dict.fromkeys(row["goal"] for row, _ in ends)
+            line[f"seeds_at_{budget}"] = len({row["seed"] for row, _ in ends})
+            middle = {
+                figure: [median(at[figure] for row, at in ends if row["goal"] == name) for name in names]
                 for figure in ("iou", "l2_reduction")
             }
-            line[f"reached_at_{budget}"] = sum(iou >= REACHED for iou in ends["iou"])
-            line[f"iou_at_{budget}"] = median(ends["iou"])
-            line[f"l2_reduction_at_{budget}"] = median(ends["l2_reduction"])
-        line["median_seconds"] = median(row["seconds"] for row in mine)
+            line[f"reached_at_{budget}"] = sum(iou >= REACHED for iou in middle["iou"])
+            line[f"iou_at_{budget}"] = median(middle["iou"])
+            line[f"l2_reduction_at_{budget}"] = median(middle["l2_reduction"])
+        line["milliseconds_a_call"] = 1e3 * median(row["seconds"] / row["calls"] for row in mine)
         out.append(line)
     return out
+
+
+def at_budget(rows: list[Row], budget: int) -> list[tuple[Row, Row]]:
+    """The rows that were run with so many calls, each with what it had then."""
+    return [(row, at) for row in rows for at in row["at"] if at["budget"] == budget]
 
 
 GOALS: dict[str, Callable[[], list[StrokeGoal]]] = {
@@ -212,15 +219,35 @@ def bench_strokes(
     methods: tuple[str, ...] = (),
     out: Path | None = None,
 ) -> dict[str, list[Row]]:
-    """Methods (all, unless named) on one kind of `GOALS`, with up to so many calls."""
+    """Methods (all, unless named) on one kind of `GOALS`, with up to so many calls; with a folder `out`, together with all
+    that is there of these goals."""
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise ValueError(f"methods: got {', '.join(unknown)}; give some of {', '.join(METHODS)}")
     tell("making the goals")
     chosen = {name: METHODS[name] for name in methods or METHODS}
     budgets = (*(b for b in BUDGETS if b < calls), calls)
-    rows = run_all(chosen, GOALS[goals](), budgets, seeds, out, tell)
+    some = GOALS[goals]()
+    rows = run_all(chosen, some, budgets, seeds, out, tell)
+    if out:
+        names = {goal.name for goal in some}
+        rows = [row for row in _known(out / "strokes.jsonl").values() if row["goal"] in names]
     return {"strokes": reached(rows), "strokes_by_goal": [_line(row) for row in rows], "strokes_curves": rows}
+
+
+def found(goals: str, rows: list[Row]) -> list[tuple[str, float, np.ndarray, np.ndarray]]:
+    """What the first method and seed had found of each goal in the end: its name, the IoU, and the changes of height (m)
+    that the goal and the plan found make."""
+    out = []
+    mine = {
+        row["goal"]: row for row in reversed(rows) if (row["method"], row["seed"]) == (rows[0]["method"], rows[0]["seed"])
+    }
+    for goal in GOALS[goals]():
+        if goal.name in mine and mine[goal.name]["at"][-1]["plan"] is not None:
+            plan = np.array(mine[goal.name]["at"][-1]["plan"])
+            after = SandLoss(goal.scene, goal.start, goal.goal).maps(plan[None])[0]
+            out.append((goal.name, goal.iou(after), goal.goal - goal.start, after - goal.start))
+    return out
 
 
 def _line(row: Row) -> Row:
@@ -243,12 +270,12 @@ def _key(row: Row) -> tuple:
     return row["method"], row["goal"], row["seed"], row["strokes"]
 
 
-def _read(path: Path) -> list[Row]:
-    """The rows of a file; a last line that was cut off is left out."""
+def _known(path: Path) -> dict[tuple, Row]:
+    """The rows of a file by their keys, of several those with most calls; a last line that was cut off is left out."""
     rows = []
     for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
             continue
-    return rows
+    return {_key(row): row for row in sorted(rows, key=lambda row: max(row["budgets"]))}

@@ -21,10 +21,11 @@ from jaxsand.sim import step, step_batch
 from jaxsand.task import fits
 from jaxsand.window import Whole, Window
 
-GRADIENT = 5
+GRADIENT = 4
 """Calls that going back through one stroke costs, as `jaxsand bench grad` measures it, rounded up."""
 
 _SIZES = (8, 16, 32, 64)  # of a group, on a CPU: a few, so that a scene compiles a few programs
+_PULLED = 16  # the most that are pulled back together, on a CPU: their tapes stay in a core's cache
 _WINDOW = (16, 16)
 
 
@@ -130,7 +131,7 @@ def _by_length(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> tuple[np.
         shaped = step_batch(scene, maps[who], strokes[who], chunk=len(who))
         return shaped.height, shaped.outcome
 
-    for group, (height, outcome) in _grouped(strokes, one):
+    for group, (height, outcome) in _grouped(strokes, _SIZES[-1], one):
         after[group], outcomes[group] = height, outcome
     after[(outcomes & ~Outcome.WINDOW_EDGE) != 0] = np.nan
     if isinstance(scene.window, Whole):
@@ -147,7 +148,7 @@ def _pulled(scene: Scene, maps: np.ndarray, strokes: np.ndarray, back: np.ndarra
     def one(group: np.ndarray, who: np.ndarray) -> tuple[Any, Any]:
         return _pull_program()(scene, maps[who], strokes[who], back[who])
 
-    for group, (m, s) in _grouped(strokes, one):
+    for group, (m, s) in _grouped(strokes, _PULLED, one):
         of_maps[group], of_strokes[group] = m, s
     return of_maps, of_strokes
 
@@ -160,10 +161,10 @@ def _pull_program() -> Any:
     return jax.jit(jax.vmap(pull, in_axes=(None, 0, 0, 0)), compiler_options=wide_vectors())
 
 
-def _grouped(strokes: np.ndarray, one: Callable) -> Iterator[tuple[np.ndarray, tuple]]:
+def _grouped(strokes: np.ndarray, most: int, one: Callable) -> Iterator[tuple[np.ndarray, tuple]]:
     """What `one(group, padded group)` gives for groups of strokes of like length, as long as the group."""
     order = np.argsort(np.hypot(*(strokes[:, 2:] - strokes[:, :2]).T), kind="stable")[::-1]
-    size = _size(len(order))
+    size = _size(len(order), most)
     groups = [order[i : i + size] for i in range(0, len(order), size)]
 
     def part(group: np.ndarray) -> tuple:
@@ -179,7 +180,7 @@ def _windowed(scene: Scene) -> bool:
     return isinstance(scene.window, Whole) and all(n >= m for n, m in zip(scene.grid.shape, _WINDOW, strict=True))
 
 
-def _size(count: int) -> int:
+def _size(count: int, most: int) -> int:
     if jax.default_backend() != "cpu":
         return 1 << max(0, count - 1).bit_length()
-    return next((size for size in _SIZES if size * cores() >= count), _SIZES[-1])
+    return next(size for size in _SIZES if size * cores() >= count or size == most)

@@ -152,11 +152,13 @@ def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch)
     assert "reached at 4000" in text
     assert "random shooting" in text
     assert "bar" in text
-    assert {path.name for path in tmp_path.iterdir()} == {"strokes.jsonl", "bench-strokes.json", "bench-strokes.png"}
+    pictures = {"bench-strokes.png", "bench-strokes-found.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"strokes.jsonl", "bench-strokes.json", *pictures}
     assert main(["bench", "strokes", "--out", str(tmp_path), "--seed", "1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["strokes"][0]["goals"] == 1
-    assert [row["seed"] for row in report["strokes_curves"]] == [1]
+    assert [row["seed"] for row in report["strokes_curves"]] == [0, 1]
+    assert report["strokes"][0]["seeds_at_4000"] == 2
     assert main(["bench", "strokes", "--methods", "shooting"]) == 2
     assert "methods: got shooting; give some of random shooting" in capsys.readouterr().err
 

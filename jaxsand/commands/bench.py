@@ -31,10 +31,15 @@ def run_benchmark(options: argparse.Namespace) -> None:
             with written(out / "bench-trench.png") as path:
                 save_figure(spacing_figure(report["trench_by_spacing"]), path)
         if "strokes_curves" in report:
-            from jaxsand.strokefigures import strokes_figure
+            from jaxsand.strokebench import found
+            from jaxsand.strokefigures import found_figure, strokes_figure
 
             with written(out / "bench-strokes.png") as path:
                 save_figure(strokes_figure(report["strokes_curves"]), path)
+            shown = found(options.goals, report["strokes_curves"])
+            if shown:
+                with written(out / "bench-strokes-found.png") as path:
+                    save_figure(found_figure(shown), path)
         with written(out / f"bench-{options.what}.json") as path:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
