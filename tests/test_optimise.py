@@ -11,8 +11,8 @@ from jaxsand.__main__ import main
 from jaxsand.optimise import as_many_as_pay, print_of
 from jaxsand.optimise.account import Account
 from jaxsand.optimise.moves import reordered
-from jaxsand.optimise.sketch import guesses, prints
-from jaxsand.strokebench import letters, stroke_goal
+from jaxsand.optimise.sketch import guesses, printed, prints
+from jaxsand.strokebench import letters, many_strokes, stroke_goal
 from jaxsand.strokeloss import GRADIENT, SandLoss
 
 
@@ -48,10 +48,22 @@ def test_a_print_is_its_stroke_wherever_it_is_moved(bar):
 
 def test_the_sketch_of_one_stroke_is_within_a_quarter_of_a_cell(bar):
     mark = print_of(account(bar, 1))
-    plans, left = guesses(mark, bar.goal, 1, np.random.default_rng(0))
+    plans, left = guesses(mark, bar.start, bar.goal, 1, np.random.default_rng(0))
     assert np.abs(plans[0, 0] * 0.01 - bar.strokes[0]).max() < 0.0025
     assert left[0] < 0.3
     assert np.all(np.diff(left) >= 0)
+
+
+def test_where_strokes_cross_prints_one_after_the_other_come_closer_than_their_sum():
+    ends = []
+    for crossed in many_strokes(goals=3):
+        mark, cells = print_of(account(crossed, 1)), crossed.strokes / 0.01
+        each = prints(mark, cells, (32, 32))
+        laid = printed(mark, cells, crossed.start)
+        assert float(laid.min()) >= float(each.min()) - 1e-9  # no deeper than the blade
+        ends.append([float(((np.asarray(h) - crossed.goal) ** 2).sum()) for h in (laid, each.sum(0))])
+    ours, summed = np.sum(ends, axis=0)
+    assert ours < 0.75 * summed
 
 
 def test_gradients_are_those_of_the_losses_and_are_counted(tee):

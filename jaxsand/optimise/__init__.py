@@ -94,10 +94,9 @@ def search(account: Account, strokes: int | None, rng: np.random.Generator, most
 
 def as_many_as_pay(account: Account, mark: Print, most: int, rng: np.random.Generator) -> int:
     """The fewest strokes whose prints come nearly as close as those of any number up to `most`; without any calls."""
-    change = account.sand.goal - account.sand.start
-    far: list[float] = []
+    sand, far = account.sand, list[float]()
     for n in range(1, most + 1):
-        far.append(guesses(mark, change, n, rng)[1][0])
+        far.append(guesses(mark, sand.start, sand.goal, n, rng)[1][0])
         if n > 2 and min(far[-2:]) > min(far):  # the prints of more only get in each other's way
             break
     return 1 + next(n for n, left in enumerate(far) if left <= _NEARLY * min(far))
@@ -119,7 +118,7 @@ def print_of(account: Account) -> Print:
 def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator) -> moves.Plans | None:
     """Plans from the sketch, closest first; None if the budget is spent."""
     dx = float(account.sand.scene.grid.spacing)
-    plans = guesses(mark, account.sand.goal - account.sand.start, strokes, rng)[0] * dx
+    plans = guesses(mark, account.sand.start, account.sand.goal, strokes, rng)[0] * dx
     plans = np.clip(plans, *account.sand.bounds)
     plans = plans[: max(1, min(len(plans), account.room(strokes) // 4))]
     losses = account.losses(plans)

@@ -103,7 +103,7 @@ def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generat
         left = account.maps(rest[None])[0] if n > 1 else account.sand.start
         if np.isnan(left).any():
             continue
-        new = _inside(account, guesses(mark, account.sand.goal - left, 1, rng)[0][:_TRIED, 0] * dx)
+        new = _inside(account, guesses(mark, left, account.sand.goal, 1, rng)[0][:_TRIED, 0] * dx)
         others += [np.insert(rest, place, stroke, axis=0) for stroke in new for place in {0, k, n - 1}]
     if not others:
         return start

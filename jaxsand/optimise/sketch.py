@@ -1,8 +1,9 @@
-"""First guesses, at the cost of one call: strokes whose prints, taken from one stroke in the simulator, add up to the goal.
+"""First guesses, at the cost of one call: strokes whose prints, taken from one stroke in the simulator, make up the goal.
 
-A print is what one stroke leaves of level sand, moved, turned and lengthened in its middle. Prints of strokes between the
-cells to be dug are matched to what the goal still lacks, one after the other, keeping several plans at a time; then all
-strokes of a plan are moved by Adam on the sum of their prints, first on blurred maps, then on sharper ones.
+A print is what one stroke leaves of level sand, moved, turned and lengthened in its middle. Stroke after stroke, sand is cut
+down to the print's trench, and raised by its berms. Strokes between the cells to be dug are matched in this way to the goal,
+one after the other, keeping several plans at a time; then all strokes of a plan are moved by Adam, first on blurred maps,
+then on sharper ones, and put in the order that comes closest.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ _CHILDREN = 6  # of one plan among them
 _BLURS = (1.5, 0.75, 0.0)  # standard deviations in cells
 _ITERATIONS = 60  # of Adam for each blur
 _STEP = 0.15  # of Adam, in cells
-_TOGETHER = 8  # plans are filled up to so many strokes with strokes off the map, so that they share a program
+_TOGETHER = 8  # plans of more than one are filled up to so many with strokes off the map, so that they share a program
 _NOWHERE = np.array([-1e3, -1e3, -1e3 + 1, -1e3], np.float32)
 _SCALE = 1e4  # squared metres to about 1
 
@@ -52,51 +53,81 @@ def prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Array
     return map_coordinates(mark.height, where, order=1, mode="constant", cval=0.0)
 
 
-def guesses(mark: Print, change: np.ndarray, strokes: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Plans [P, N, 4] (cells) whose prints add up to `change` [H, W] (m), the closest first; and the shares [P] of the
-    squared change that they leave."""
-    plans = _matched(mark, change, strokes, rng)
+def printed(mark: Print, strokes: jax.Array, start: jax.Array) -> jax.Array:
+    """What prints of strokes [N, 4] (cells), one after the other, make of a map [H, W] (m)."""
+    each = prints(mark, strokes, (start.shape[0], start.shape[1]))
+    return jax.lax.scan(lambda h, one: (_laid(h, one), None), start, each)[0]
+
+
+def _laid(height: jax.Array, one: jax.Array) -> jax.Array:
+    return jnp.where(one < 0, jnp.minimum(height, one), height + one)
+
+
+def guesses(
+    mark: Print, start: np.ndarray, goal: np.ndarray, strokes: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plans [P, N, 4] (cells) whose prints turn `start` [H, W] (m) into nearly `goal`, the closest first; and the shares [P]
+    of the squared distance that they leave."""
+    plans = _matched(mark, start, goal, strokes, rng)
     count = len(plans)
-    filled = np.broadcast_to(_NOWHERE, (_PLANS, -(-strokes // _TOGETHER) * _TOGETHER, 4)).copy()
+    places = 1 if strokes == 1 else -(-strokes // _TOGETHER) * _TOGETHER
+    filled = np.broadcast_to(_NOWHERE, (_PLANS, places, 4)).copy()
     filled[:count, :strokes] = plans
-    moved = jnp.asarray(filled)
+    moved, maps = jnp.asarray(filled), (jnp.asarray(start, jnp.float32), jnp.asarray(goal, jnp.float32))
     for blur in _BLURS:
-        bell = np.exp(-0.5 * (np.arange(-6, 7) / max(blur, 1e-3)) ** 2)
-        moved, far = _moved(mark, moved, jnp.asarray(change), jnp.asarray(bell / bell.sum(), jnp.float32))
-    left = np.asarray(far, float)[:count] / max(float((change**2).sum()) * _SCALE, 1e-30)
+        moved = _moved(mark, moved, *maps, jnp.asarray(_bell(blur), jnp.float32))
+        if not blur and strokes > 1:
+            moved = _moved(mark, _reordered(mark, moved, strokes, *maps), *maps, jnp.asarray(_bell(blur), jnp.float32))
+    left = np.asarray(_far(mark, moved, *maps), float)[:count] / max(float(_SCALE * ((goal - start) ** 2).sum()), 1e-30)
     order = np.argsort(left, kind="stable")
     return np.asarray(moved, float)[order, :strokes], left[order]
 
 
-def _matched(mark: Print, change: np.ndarray, strokes: int, rng: np.random.Generator) -> np.ndarray:
-    ways = _ways(change, rng)
-    shape = change.shape
+def _bell(blur: float) -> np.ndarray:
+    bell = np.exp(-0.5 * (np.arange(-6, 7) / max(blur, 1e-3)) ** 2)
+    return bell / bell.sum()
+
+
+def _reordered(mark: Print, plans: jax.Array, strokes: int, start: jax.Array, goal: jax.Array) -> jax.Array:
+    """Every plan with two strokes swapped, as long as that brings its prints closer."""
+    pairs = [(i, j) for i in range(strokes) for j in range(i + 1, strokes)]
+    orders = np.tile(np.arange(plans.shape[1]), (len(pairs) + 1, 1))
+    for k, (i, j) in enumerate(pairs):
+        orders[k, [i, j]] = j, i
+    for _ in range(strokes):
+        far = _far_in_orders(mark, plans, jnp.asarray(orders), start, goal)
+        best = orders[np.argmin(np.asarray(far) + 1e-6 * np.arange(len(pairs) + 1)[::-1], axis=1)]
+        if (best == orders[-1]).all():
+            break
+        plans = jnp.take_along_axis(plans, jnp.asarray(best)[..., None], axis=1)
+    return plans
+
+
+def _matched(mark: Print, start: np.ndarray, goal: np.ndarray, strokes: int, rng: np.random.Generator) -> np.ndarray:
+    ways = _ways(goal - start, rng)
     filled = np.broadcast_to(_NOWHERE, (_POINTS * (_POINTS - 1), 4)).astype(np.float32)
     filled[: len(ways)] = ways
-    each = np.asarray(_prints(mark, jnp.asarray(filled), shape), np.float32)[: len(ways)].reshape(len(ways), -1)
-    own = (each**2).sum(1)
-    left = change.astype(np.float32).reshape(1, -1)
-    plans = np.zeros((1, 0), int)
+    each = _prints(mark, jnp.asarray(filled), goal.shape)
+    maps, plans = np.asarray(start, np.float32)[None], np.zeros((1, 0), int)
     for _ in range(strokes):
-        change_of = own - 2 * left @ each.T  # of the squared distance, [plans, ways]
-        best = np.argsort(change_of, axis=1)[:, : 8 * _CHILDREN]
+        padded = np.concatenate([maps, np.repeat(maps[-1:], _PLANS - len(maps), axis=0)])
+        far = np.asarray(_far_after(jnp.asarray(padded), each, jnp.asarray(goal, jnp.float32)))[: len(maps), : len(ways)]
         children = []
-        for plan, row in enumerate(best):
+        for plan, row in enumerate(far):
             kept: list[int] = []
-            for way in row:  # of like ways only the best
+            for way in np.argsort(row)[: 8 * _CHILDREN]:  # of like ways only the best
                 if all(np.abs(ways[way] - ways[k]).max() > 2 for k in kept):
-                    kept.append(way)
-                if len(kept) == (_PLANS if len(best) == 1 else _CHILDREN):
+                    kept.append(int(way))
+                if len(kept) == (_PLANS if len(far) == 1 else _CHILDREN):
                     break
             children += [(plan, way) for way in kept]
         parent, way = np.array(children).T
-        after = left[parent] - each[way]
-        far = (after**2).sum(1)
-        order = np.argsort(far, kind="stable")
+        order = np.argsort(far[parent, way], kind="stable")
         plans = np.concatenate([plans[parent], way[:, None]], axis=1)
         _, first = np.unique(np.sort(plans[order], axis=1), axis=0, return_index=True)
         kept_ones = order[np.sort(first)][:_PLANS]
-        plans, left = plans[kept_ones], after[kept_ones]
+        plans = plans[kept_ones]
+        maps = np.asarray(_laid(jnp.asarray(maps[parent[kept_ones]]), each[way[kept_ones]]))
     return ways[plans]
 
 
@@ -128,20 +159,39 @@ def _adam() -> Any:
 
 
 @jax.jit
-def _moved(mark: Print, plans: jax.Array, change: jax.Array, taps: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _far_after(maps: jax.Array, each: jax.Array, goal: jax.Array) -> jax.Array:
+    """The squared distances [P, W] from the goal of maps [P, H, W] after each of W prints."""
+    return jax.lax.map(lambda h: jnp.sum((_laid(h[None], each) - goal[None]) ** 2, axis=(1, 2)), maps)
+
+
+def _off(mark: Print, plan: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
+    return printed(mark, plan, start) - goal
+
+
+@jax.jit
+def _far(mark: Print, plans: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
+    return jax.vmap(lambda plan: jnp.sum(_off(mark, plan, start, goal) ** 2) * _SCALE)(plans)
+
+
+@jax.jit
+def _far_in_orders(mark: Print, plans: jax.Array, orders: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
+    """The squared distances [P, O] of plans in other orders [O, N]."""
+    return jax.lax.map(lambda plan: _far(mark, plan[orders], start, goal), plans)
+
+
+@jax.jit
+def _moved(mark: Print, plans: jax.Array, start: jax.Array, goal: jax.Array, taps: jax.Array) -> jax.Array:
     def smooth(h: jax.Array) -> jax.Array:
         for axis in (0, 1):
             h = jnp.apply_along_axis(lambda row: jnp.convolve(row, taps, mode="same"), axis, h)
         return h
 
     def far(plan: jax.Array) -> jax.Array:
-        added = jnp.sum(prints(mark, plan, (change.shape[0], change.shape[1])), axis=0)
-        return jnp.sum(smooth(added - change) ** 2) * _SCALE
+        return jnp.sum(smooth(_off(mark, plan, start, goal)) ** 2) * _SCALE
 
     def step(carry: Any, _: Any) -> tuple[Any, None]:
         plans, state = carry
         update, state = _adam().update(jax.vmap(jax.grad(far))(plans), state)
         return (optax.apply_updates(plans, update), state), None
 
-    (plans, _), _ = jax.lax.scan(step, (plans, _adam().init(plans)), None, length=_ITERATIONS)
-    return plans, jax.vmap(far)(plans)
+    return jax.lax.scan(step, (plans, _adam().init(plans)), None, length=_ITERATIONS)[0][0]
