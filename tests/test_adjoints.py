@@ -36,7 +36,6 @@ def central(f, x, seed=0, e=1e-7):
 
 WAYS = {
     "walls": {"walls": SOLID},
-    "window": {"window": js.Window((12, 12), 1.0)},
     "angles in a window": {"window": js.Window((12, 12), 1.0), "angle": ANGLES},
     "straight neighbours": {"neighbours": 4},
     "draining": {"edge": js.Draining(-0.003)},
