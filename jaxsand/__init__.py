@@ -20,6 +20,7 @@ _HOMES = {
     "Multilevel": "schemes",
     "NoTool": "tool",
     "Open": "walls",
+    "Blurred": "optimise",
     "Optimised": "optimise",
     "Outcome": "rules",
     "OutcomeError": "sim",

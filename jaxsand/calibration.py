@@ -72,6 +72,8 @@ def calibrate(
     check_whole("starts", starts, 1)
     check_noise(noise)
     check_rule(scene, scheme, stop)
+    if push is not None and not isinstance(push, Push):
+        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
     groups, seen = _grouped(scene, some)
     labels = _labels(scene, regions)
     ranges, names = _ranges(scene, free, 0 if labels is None else int(labels.max()) + 1)
@@ -136,10 +138,16 @@ def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
     """Trials of as many strokes, stacked; and the number of cells seen."""
     if not trials:
         raise ValueError("trials: got none; give at least one Trial(before, after, stroke)")
+    for trial in trials:
+        if not isinstance(trial, Trial):
+            raise ValueError(f"trials: got {type(trial).__name__}; give Trial(before, after, stroke), or several")
     groups: dict[int, list[Any]] = {}
     dtype = jnp.result_type(*(as_array("before", trial.before) for trial in trials))
     for trial in trials:
-        before = fit(scene, as_array("before", trial.before, dtype))[1]
+        try:
+            before = fit(scene, as_array("before", trial.before, dtype))[1]
+        except ValueError as error:
+            raise ValueError(str(error).replace("height:", "before:", 1)) from None
         after = as_array("after", trial.after, dtype)
         strokes = jnp.zeros((0, 4), dtype) if trial.stroke is None else as_array("stroke", trial.stroke, dtype)
         if strokes.shape != (4,) and (strokes.ndim != 2 or strokes.shape[1] != 4):

@@ -93,7 +93,9 @@ def shares(p: jax.Array, q: jax.Array) -> Shares:
 def radial(job: Job, pose: Pose) -> Shares:
     """The shares for directions away from the blade's centre, in its proportions."""
     along, across = local(pose, job.x, job.y)
-    s, n = along / job.tool.thickness**2, across / job.tool.width**2
+    least = 1e-3 * job.bed.spacing  # a blade of no width or thickness pushes nothing, but must not divide by nothing
+    thickness, width = (jnp.maximum(x, least) for x in (job.tool.thickness, job.tool.width))
+    s, n = along / thickness**2, across / width**2
     return outwards(job, pose, s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos)
 
 

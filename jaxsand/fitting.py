@@ -21,6 +21,7 @@ Model = TypeVar("Model")
 _LOOKS = 40
 _NEAR = 1e-4  # of sigma^2: what a step that is not worth taking promises, 0.01 standard errors
 _FINE = 1e-5  # of a range: a step that is none
+_SPARE = 20  # numbers from which noise is known to about a sixth
 _IDLE = 12.0  # 1 / variance of a parameter of which no more is known than its range
 
 
@@ -39,6 +40,8 @@ class Verdict(IntFlag):
     """The residual is larger than the given noise explains, by five standard deviations: doubt the model, or the noise."""
     UNCLEAN = 32
     """The simulator's outcome is not clean at the estimate (see `jaxsand.check`), or a section's model ends next to it."""
+    FEW_DATA = 64
+    """The noise was estimated from fewer than 20 numbers more than are free: the errors may be far off; give `noise`."""
 
 
 @dataclass(frozen=True)
@@ -84,14 +87,14 @@ def as_ranges(free: Any) -> dict[str, tuple[float, float] | None]:
     if not ranges:
         raise ValueError("free: got no names; free at least one parameter")
     for name, ends in ranges.items():
-        if ends is not None and np.shape(ends) != (2,):
+        if ends is not None and (np.shape(ends) != (2,) or np.asarray(ends).dtype.kind not in "iuf"):
             raise ValueError(f"free: got {ends!r} for {name}; give (low, high)")
     return ranges
 
 
 def check_noise(noise: float | None) -> None:
     """Raises ValueError unless the noise is None or a positive number."""
-    if noise is not None and not 0 < noise < math.inf:
+    if noise is not None and not (isinstance(noise, int | float | np.number) and 0 < noise < math.inf):
         raise ValueError(f"noise: got {noise!r}; give its sigma in metres, such as 6e-4, or None to estimate it")
 
 
@@ -198,6 +201,8 @@ def conclude(
     apart = np.sum(((ends - x) @ (ways[:, told] * np.sqrt(curves[told]))) ** 2, axis=1)
     if np.any(done & (costs - cost < 4 * sigma**2) & (apart > 25)):
         verdict |= Verdict.AMBIGUOUS
+    if noise is None and spare < _SPARE:
+        verdict |= Verdict.FEW_DATA
     if noise is not None and cost / noise**2 > spare + 5 * math.sqrt(2 * spare):
         verdict |= Verdict.POOR_FIT
     values = low + x * (high - low)

@@ -190,7 +190,8 @@ def _check_walls(walls: Any, shape: tuple[int, int]) -> None:
                 f"walls.solid: got {solid.dtype} of shape {list(solid.shape)}; give booleans of shape {list(shape)}"
             )
     elif not isinstance(walls, Open):
-        raise ValueError(f"walls: got {walls!r}; give Open() or Walls(solid)")
+        got = type(walls).__name__ if hasattr(walls, "shape") else repr(walls)
+        raise ValueError(f"walls: got {got}; give Open() or Walls(solid)")
 
 
 def _check_edge(edge: Any) -> None:

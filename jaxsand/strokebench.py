@@ -147,8 +147,7 @@ def run_all(
                 if row is None or not set(budgets) <= set(row["budgets"]):
                     row = want | run_one(method, goal, budgets, seed)
                     if path:
-                        with path.open("a", encoding="utf-8") as file:
-                            file.write(json.dumps(row) + "\n")
+                        _append(path, row)
                 rows.append(_up_to(row, budgets))
     return rows
 
@@ -223,7 +222,7 @@ def bench_strokes(
     that is there of these goals."""
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
-        raise ValueError(f"methods: got {', '.join(unknown)}; give some of {', '.join(METHODS)}")
+        raise ValueError(f"methods: got {', '.join(map(repr, unknown))}; give some of {', '.join(METHODS)}")
     tell("making the goals")
     chosen = {name: METHODS[name] for name in methods or METHODS}
     budgets = (*(b for b in BUDGETS if b < calls), calls)
@@ -270,12 +269,22 @@ def _key(row: Row) -> tuple:
     return row["method"], row["goal"], row["seed"], row["strokes"]
 
 
+def _append(path: Path, row: Row) -> None:
+    """Adds a line; one that was cut off before it is ended first."""
+    whole = not path.is_file() or path.read_bytes()[-1:] in (b"", b"\n")
+    with path.open("a", encoding="utf-8") as file:
+        file.write(("" if whole else "\n") + json.dumps(row) + "\n")
+
+
 def _known(path: Path) -> dict[tuple, Row]:
-    """The rows of a file by their keys, of several those with most calls; a last line that was cut off is left out."""
+    """The rows of a file by their keys, of several those with most calls; lines that were cut off are left out."""
     rows = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.is_file() else [], 1):
         try:
-            rows.append(json.loads(line))
+            row = json.loads(line)
         except json.JSONDecodeError:
             continue
+        if not isinstance(row, dict) or not {"method", "goal", "seed", "strokes", "budgets", "at", "curve"} <= set(row):
+            raise ValueError(f"out: line {number} of {path} is no row of this bench; take it out, or give another folder")
+        rows.append(row)
     return {_key(row): row for row in sorted(rows, key=lambda row: max(row["budgets"]))}

@@ -68,7 +68,7 @@ class SandLoss:
     goal: np.ndarray
 
     def __post_init__(self) -> None:
-        fits(self.scene, self.start)
+        fits(self.scene, self.start, "start")
         fits(self.scene, self.goal)
 
     def __call__(self, candidates: np.ndarray) -> np.ndarray:

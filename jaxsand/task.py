@@ -99,17 +99,17 @@ def _resample_rows(image: np.ndarray, rows: int) -> np.ndarray:
     return image[low] * (1 - part) + image[np.minimum(low + 1, old - 1)] * part
 
 
-def fits(scene: Scene, goal: np.ndarray) -> None:
-    """Raises ValueError unless the goal has the scene's shape and is finite."""
+def fits(scene: Scene, goal: np.ndarray, name: str = "goal") -> None:
+    """Raises ValueError unless a goal, or what goes by that name, has the scene's shape and is finite."""
     if goal.shape != scene.grid.shape:
         raise ValueError(
-            f"goal: got shape {list(goal.shape)}, the scene has {list(scene.grid.shape)}; "
+            f"{name}: got shape {list(goal.shape)}, the scene has {list(scene.grid.shape)}; "
             "make the scene as large, or use task.resample"
         )
-    finite(goal)
+    finite(goal, name)
 
 
-def finite(goal: np.ndarray) -> None:
-    """Raises ValueError unless every cell of the goal is finite."""
+def finite(goal: np.ndarray, name: str = "goal") -> None:
+    """Raises ValueError unless every cell is finite."""
     if not np.all(np.isfinite(goal)):
-        raise ValueError(f"goal: got {int(np.sum(~np.isfinite(goal)))} cells that are not finite; fill them first")
+        raise ValueError(f"{name}: got {int(np.sum(~np.isfinite(goal)))} cells that are not finite; fill them first")

@@ -143,6 +143,8 @@ def test_mixtures_and_rivals_are_said():
     rivals = fitted(lambda x: 4 * (x[0] - 0.2) * (x[0] - 0.8) + error, two[:1])
     assert rivals.verdict == js.Verdict.AMBIGUOUS
     assert fitted(lambda x: x[0] - 0.5 + error, two[:1], clean=False).verdict == js.Verdict.UNCLEAN
+    few = fitted(lambda x: x[0] - 0.5 + error[:20], two[:1], count=20)
+    assert few.verdict == js.Verdict.FEW_DATA
 
 
 def section(run, profile, seed, guess):
@@ -198,6 +200,11 @@ REFUSED = {
     ),
     "degrees": (lambda: js.calibrate(BLADE, TRIAL, free={"repose_angle": (10, 50)}), "give rad above 0"),
     "a blade above": (lambda: js.calibrate(sand(29, js.Blade(depth=-0.01)), TRIAL), "give its range"),
+    "letters for a range": (lambda: js.calibrate(BLADE, TRIAL, free={"width": ("a", "b")}), r"free: got \('a', 'b'\)"),
+    "a pair for a trial": (lambda: js.calibrate(BLADE, [(LEVEL, LEVEL)]), r"trials: got tuple; give Trial"),
+    "a smaller map": (lambda: js.calibrate(BLADE, js.Trial(LEVEL[1:], LEVEL[1:])), r"before: got shape \[31, 32\]"),
+    "a number for a push": (lambda: js.calibrate(BLADE, TRIAL, push=3), "push: got 3; give SteppedPush"),
+    "a name for noise": (lambda: js.calibrate(BLADE, TRIAL, noise="a"), "noise: got 'a'"),
     "a silent noise": (lambda: js.calibrate(BLADE, TRIAL, noise=0.0), "noise: got 0.0"),
     "no starts": (lambda: js.calibrate(BLADE, TRIAL, starts=0), "starts: got 0"),
     "labels of floats": (lambda: js.calibrate(BLADE, TRIAL, regions=LEVEL), "regions: got float32"),

@@ -1,5 +1,7 @@
 """Derivatives against central differences in float64, forward against reverse mode, and what is refused."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +65,15 @@ def test_the_gradient_of_settling_is_that_of_its_sweeps():
 
     for a, b in zip(of(None), of(js.Sweeps(sweeps)), strict=True):
         assert np.allclose(a, b, rtol=1e-12, atol=1e-14)
+
+
+def test_a_blade_of_no_width_has_finite_derivatives():
+    def pushed(size):
+        scene = replace(js.make_scene((12, 12), 0.01), tool=js.Blade(size[0], size[1], 0.0075))
+        return jnp.sum(jnp.sin(300 * js.step(scene, jnp.zeros((12, 12)), jnp.array([0.03, 0.06, 0.08, 0.07])).height))
+
+    slopes = jax.jit(jax.vmap(jax.grad(pushed)))(jnp.array([[0.0, 0.015], [0.02, 0.0], [0.0, 0.0]]))
+    assert np.all(np.isfinite(slopes))
 
 
 def test_gradients_under_vmap_and_jit_and_where_nothing_changes():

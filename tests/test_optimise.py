@@ -8,7 +8,7 @@ import pytest
 
 import jaxsand as js
 from jaxsand.__main__ import main
-from jaxsand.optimise import as_many_as_pay, print_of
+from jaxsand.optimise import as_many_as_pay, print_of, search
 from jaxsand.optimise.account import Account
 from jaxsand.optimise.moves import reordered
 from jaxsand.optimise.sketch import guesses, printed, prints
@@ -109,11 +109,46 @@ def test_the_number_of_strokes_is_found(bar, tee):
         assert as_many_as_pay(counted, print_of(counted), 5, np.random.default_rng(0)) == len(goal.strokes)
 
 
+def test_strokes_that_would_make_it_worse_are_not_given(bar):
+    bump = np.zeros((32, 32), np.float32)
+    bump[8:12, 8:12] = 5e-4
+    for strokes in (1, None):
+        found = js.optimise_strokes(bar.scene, bump, strokes=strokes, budget=40)
+        assert found.strokes.shape == (0, 4)
+        assert found.losses.tolist() == [pytest.approx(16 * 5e-4**2)]
+        assert not found.height.any()
+        assert 0 < found.spent <= 40
+
+
+def test_smoothing_can_be_left_out_and_changed(tee):
+    def blurs(smoothing):
+        counted, seen = account(tee, 1000), []
+        take = counted.gradient
+
+        def noted(plans, blur):
+            seen.append(blur)
+            return take(plans, blur)
+
+        counted.gradient = noted
+        search(counted, 2, np.random.default_rng(0), smoothing=smoothing)
+        return seen
+
+    assert set(blurs(None)) == {0.0}
+    assert blurs(js.Blurred((2.0, 1.0)))[:12] == [2.0] * 6 + [1.0] * 6
+    with pytest.raises(ValueError, match=r"smoothing.cells: got \(0.0,\)"):
+        js.Blurred((0.0,))
+
+
 def test_what_is_refused(bar):
     for kwargs, message in [
         ({"goal": np.zeros((3, 3))}, r"goal: got shape \[3, 3\]"),
         ({"strokes": 0}, "strokes: got 0"),
         ({"budget": 0}, "budget: got 0"),
+        ({"start": np.zeros((3, 3))}, r"start: got shape \[3, 3\]"),
+        ({"start": np.full((32, 32), np.nan)}, "start: got 1024 cells that are not finite"),
+        ({"key": 3.5}, "key: got 3.5"),
+        ({"key": -1}, "key: got -1"),
+        ({"key": None}, "key: got None"),
         ({"scene": js.make_scene((32, 32), 0.01)}, "scene.tool: got NoTool"),
     ]:
         with pytest.raises(ValueError, match=message):

@@ -131,6 +131,11 @@ def test_the_bench_writes_what_it_computes_and_does_not_compute_it_again(bar, tm
         raise AssertionError
 
     assert run_all({"random shooting": never}, [bar], (4, 16), (0, 1), tmp_path) == rows
+    (tmp_path / "strokes.jsonl").write_text("\n".join(lines)[:-300])
+    assert [row["at"] for row in run_all(methods, [bar], (4, 16), (0, 1), tmp_path)] == [row["at"] for row in rows]
+    assert [row["at"] for row in run_all({"random shooting": never}, [bar], (4, 16), (0, 1), tmp_path)] == [
+        row["at"] for row in rows
+    ]
     fewer = run_all({"random shooting": never}, [bar], (4,), (0,), tmp_path)[0]
     assert fewer["at"] == rows[0]["at"][:1]
     assert fewer["curve"][-1][0] <= 4
@@ -159,8 +164,14 @@ def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch)
     assert report["strokes"][0]["goals"] == 1
     assert [row["seed"] for row in report["strokes_curves"]] == [0, 1]
     assert report["strokes"][0]["seeds_at_4000"] == 2
-    assert main(["bench", "strokes", "--methods", "shooting"]) == 2
-    assert "methods: got shooting; give some of random shooting" in capsys.readouterr().err
+    (tmp_path / "strokes.jsonl").write_text('{"a": 1}\n')
+    for line, message in {
+        "strokes --methods shooting": "methods: got 'shooting'; give some of random shooting",
+        f"strokes --out {tmp_path}": "out: line 1 of ",
+        "grad --calls 50": "calls: has an effect on bench strokes only; leave it out",
+    }.items():
+        assert main(["bench", *line.split()]) == 2
+        assert message in capsys.readouterr().err
 
 
 def test_goals_of_other_kinds():
@@ -176,5 +187,5 @@ def test_goals_of_other_kinds():
 
 
 def test_a_goal_of_another_shape_is_refused(bar):
-    with pytest.raises(ValueError, match="goal"):
+    with pytest.raises(ValueError, match="start: got shape"):
         SandLoss(bar.scene, bar.start[:4], bar.goal)

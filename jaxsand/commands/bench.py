@@ -12,6 +12,10 @@ def run_benchmark(options: argparse.Namespace) -> None:
     out = folder(options.out) if options.out else None
     from jaxsand.benchmark import bench, table
 
+    if options.what != "strokes":
+        for option in ("goals", "calls", "seeds", "methods"):
+            if getattr(options, option) is not None:
+                raise ValueError(f"{option}: has an effect on bench strokes only; leave it out")
     strokes = {} if options.what != "strokes" else _of_strokes(options)
     report = bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
     if out:
@@ -36,7 +40,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
             with written(out / "bench-strokes.png") as path:
                 save_figure(strokes_figure(report["strokes_curves"]), path)
-            shown = found(options.goals, report["strokes_curves"])
+            shown = found(strokes["goals"], report["strokes_curves"])
             if shown:
                 with written(out / "bench-strokes-found.png") as path:
                     save_figure(found_figure(shown), path)
@@ -48,9 +52,9 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
 def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
     return {
-        "goals": options.goals,
-        "calls": options.calls,
-        "seeds": tuple(range(options.seed, options.seed + options.seeds)),
-        "methods": tuple(options.methods.split(",")) if options.methods else (),
+        "goals": options.goals or "letters",
+        "calls": options.calls or 4_000,
+        "seeds": tuple(range(options.seed, options.seed + (options.seeds or 1))),
+        "methods": tuple(name.strip() for name in options.methods.split(",")) if options.methods else (),
         "out": options.out,
     }

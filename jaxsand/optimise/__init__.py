@@ -5,6 +5,7 @@ several plans at once: other orders and directions, Adam on blurred and then on 
 due, L-BFGS, until the goal is reached or the budget is spent.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from jaxsand.strokeloss import Best, SandLoss, pushed
 from jaxsand.tool import Blade
 
 _LANES = 4  # plans that go downhill together
+_STEPS = 6  # of Adam on blurred maps
 _REACHED = 1e-4  # of the start's loss: near enough to stop
 _NEARLY = 1.15  # times the least of what sums of prints leave of the squared change
 
@@ -38,6 +40,18 @@ class Optimised:
     height: np.ndarray
 
 
+@dataclass(frozen=True)
+class Blurred:
+    """Smoothing: before anything goes downhill on sharp maps, Adam sees them and the goal blurred by Gaussians of these
+    standard deviations, in `cells`, one after the other. A stroke beside its trench then feels it from farther away."""
+
+    cells: tuple[float, ...] = (1.0,)
+
+    def __post_init__(self) -> None:
+        if not all(0 < c < math.inf for c in self.cells):
+            raise ValueError(f"smoothing.cells: got {self.cells!r}; give positive numbers, or smoothing=None")
+
+
 def optimise_strokes(
     scene: Scene,
     goal: jax.typing.ArrayLike,
@@ -47,16 +61,18 @@ def optimise_strokes(
     start: jax.typing.ArrayLike | None = None,
     budget: int = 4_000,
     most: int = 8,
+    smoothing: Blurred | None = Blurred(),
     tell: Callable[[str], None] = lambda _: None,
 ) -> Optimised:
     """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
 
     Minimises sum (h - goal)^2 over plans of `strokes` pushes, or of as many as pay, up to `most`, if None. Stops at a
-    ten-thousandth of the start's loss, or after `budget` simulator calls; with nothing to change there are no strokes. The
-    same key finds the same plan on the same machine. Not differentiable itself.
+    ten-thousandth of the start's loss, or after `budget` simulator calls. Where nothing is to change, or nothing was found
+    that brings the sand closer than it was, there are no strokes. The same key finds the same plan on the same machine. Not
+    differentiable itself. The first call for a shape of map compiles, for about half a minute on two cores.
 
     Raises:
-      ValueError: for a scene without a blade, a goal of another shape, or a count out of range.
+      ValueError: for a scene without a blade, a start or goal of another shape, or a key or count out of range.
     """
     if not isinstance(scene.tool, Blade):
         raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
@@ -70,17 +86,23 @@ def optimise_strokes(
         level if start is None else np.asarray(as_array("start", start), np.float32),
         np.asarray(as_array("goal", goal), np.float32),
     )
-    rng = np.random.default_rng(np.asarray(_entropy(key)))
+    rng = np.random.default_rng(_entropy(key))
     account = Account(sand, budget, tell)
     if account.before > 0:
-        search(account, strokes, rng, most)
-    plan = account.best.strokes if account.history else np.zeros((0, 4))
-    steps = [Best(0, account.before, plan[:0]), *account.history]
+        search(account, strokes, rng, most, smoothing)
+    steps = [Best(0, account.before, np.zeros((0, 4))), *(best for best in account.history if best.loss < account.before)]
+    plan = steps[-1].strokes
     height = sand.maps(plan[None])[0]
     return Optimised(plan, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), account.calls, height)
 
 
-def search(account: Account, strokes: int | None, rng: np.random.Generator, most: int = 8) -> None:
+def search(
+    account: Account,
+    strokes: int | None,
+    rng: np.random.Generator,
+    most: int = 8,
+    smoothing: Blurred | None = Blurred(),
+) -> None:
     """Spends the account's budget on plans of so many strokes, or of as many as pay."""
     mark = print_of(account)
     count = strokes or as_many_as_pay(account, mark, most, rng)
@@ -89,7 +111,7 @@ def search(account: Account, strokes: int | None, rng: np.random.Generator, most
         felt = moves.stroke_by_stroke(account, count, account.room(count) * count // 2, rng)
         plans = moves.ranked(np.concatenate([felt[0], plans[0]]), np.concatenate([felt[1], plans[1]]), 1)
     if plans is not None:
-        improve(account, mark, plans, rng)
+        improve(account, mark, plans, rng, smoothing)
 
 
 def as_many_as_pay(account: Account, mark: Print, most: int, rng: np.random.Generator) -> int:
@@ -125,11 +147,12 @@ def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator)
     return moves.ranked(plans, losses, _LANES) if np.isfinite(losses).any() else None
 
 
-def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Generator) -> None:
+def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Generator, smoothing: Blurred | None) -> None:
     """Rounds of moves until the goal is reached or the budget is spent."""
     dx = float(account.sand.scene.grid.spacing)
     plans = moves.reordered(account, plans)
-    plans = moves.adam(account, plans, 6, 0.15 * dx, blur=1.0)
+    for blur in smoothing.cells if smoothing else ():
+        plans = moves.adam(account, plans, _STEPS, 0.15 * dx, blur)
     while account.best.loss > _REACHED * account.before and account.room(plans[0].shape[1]) > 0:
         last, spent = plans[1][0], account.calls
         plans = moves.reordered(account, plans)
@@ -150,6 +173,9 @@ def _joined(a: moves.Plans, b: moves.Plans) -> moves.Plans:
 
 
 def _entropy(key: jax.Array | int) -> np.ndarray:
-    if isinstance(key, int):
-        return np.array([key])
-    return np.asarray(jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key).ravel()
+    if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jax.random.key_data(key)
+    numbers = np.atleast_1d(np.asarray(key)).ravel()
+    if numbers.dtype.kind not in "iu" or not len(numbers) or numbers.min() < 0:
+        raise ValueError(f"key: got {key!r}; give jax.random.key(0), or a whole number from 0 on")
+    return numbers
