@@ -9,6 +9,7 @@ from typing import Any
 
 _HOMES = {
     "Blade": "tool",
+    "Blurred": "optimise",
     "Calibration": "fitting",
     "Closed": "walls",
     "DRY_SAND": "material",
@@ -20,7 +21,6 @@ _HOMES = {
     "Multilevel": "schemes",
     "NoTool": "tool",
     "Open": "walls",
-    "Blurred": "optimise",
     "Optimised": "optimise",
     "Outcome": "rules",
     "OutcomeError": "sim",
