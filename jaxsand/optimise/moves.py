@@ -127,7 +127,9 @@ def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.
                 drawn = np.where(rng.random((_DRAWN, 1)) < 0.5, drawn, anywhere)
             else:
                 drawn = best + rng.normal(0, 1, (_DRAWN, 4)) * np.geomspace(0.3, 6, _DRAWN)[:, None] * dx
-            drawn = _inside(account, drawn)
+            drawn = _inside(account, drawn)[: account.room(1)]
+            if not len(drawn):
+                break
             far, maps = account.after(here, drawn)
             first = int(np.argmin(far))
             if far[first] < least:
