@@ -27,7 +27,7 @@ class Bed:
     spacing: jax.Array  # m, []
     drop: jax.Array  # the largest stable step between straight neighbours, mu dx: [] or [H, W]
     rim: "Rim | None"
-    elsewhere: jax.Array  # the largest height outside, where the bed is a block of a map (m), []
+    elsewhere: jax.Array  # the largest |height| outside a block of a map, and of a rim that lies below 0 (m), []
     neighbours: Neighbours = field(metadata={"static": True})
 
 
@@ -45,7 +45,11 @@ def prepare(scene: Scene) -> Bed:
     dx = jnp.asarray(scene.grid.spacing)
     drop = jnp.tan(jnp.asarray(scene.material.repose_angle)) * dx
     rim = rim_of(scene.grid.shape, jnp.asarray(scene.edge.level)) if isinstance(scene.edge, Draining) else None
-    return Bed(dx, drop, rim, jnp.zeros_like(dx), scene.grid.neighbours)
+    deep = jnp.zeros_like(dx)
+    if rim is not None:  # sand comes to lie as deep as the rim
+        level = lax.stop_gradient(rim.level)
+        deep = jnp.where((level < 0) & jnp.isfinite(level), -level, 0).astype(dx.dtype)
+    return Bed(dx, drop, rim, deep, scene.grid.neighbours)
 
 
 def rim_of(shape: tuple[int, ...], level: jax.Array) -> Rim:

@@ -157,7 +157,8 @@ def _in_window(
     block, block_lost = cut(window, shape, begin, (h, lost))
     outside = paste(begin, h, jnp.where(near_edge(window, shape, begin), block, jnp.nan))
     restless = worst_excess(bed, halo(outside)) > window.tolerance
-    here = replace(cut(window, shape, begin, bed), elsewhere=largest(paste(begin, h, jnp.zeros_like(block))))
+    elsewhere = jnp.maximum(bed.elsewhere, largest(paste(begin, h, jnp.zeros_like(block))))
+    here = replace(cut(window, shape, begin, bed), elsewhere=elsewhere)
     (after, block_lost), sweeps = _run(scene, here, scheme, stop, (halo(block), block_lost))
     change = edge_movement(window, shape, begin, block, at(after), jnp.zeros_like(block))
     touched = restless | (change > window.tolerance * bed.spacing)

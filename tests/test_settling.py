@@ -295,3 +295,14 @@ def test_the_height_rules_the_dtype():
         assert s.height.dtype == dtype
         assert s.residual.dtype == dtype
         assert np.all(np.isfinite(np.asarray(s.height, float)))
+
+
+@pytest.mark.parametrize("neighbours", [8, "isotropic"])
+@pytest.mark.parametrize("dx", [1e-3, 550.0])
+def test_level_sand_at_0_drains_over_a_rim_below_it(neighbours, dx):
+    """Nothing but the rim tells how large heights are."""
+    scene = js.make_scene((6, 6), dx, 0.4, neighbours, edge=js.Draining(-1.7 * dx))
+    settled = js.settle(scene, np.zeros((6, 6), np.float32))
+    assert settled.outcome == 0
+    assert -1.7 * dx <= float(settled.height.min()) < -dx
+    assert float(settled.drained) == pytest.approx(-float(settled.height.sum()) * dx**2, rel=1e-5)
