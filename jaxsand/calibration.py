@@ -16,7 +16,7 @@ from jaxsand.rules import Stop, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, concrete, fit
 from jaxsand.schemes import Scheme
 from jaxsand.settling import settle
-from jaxsand.sim import Push, rollout
+from jaxsand.sim import Push, check_push, rollout
 from jaxsand.tool import NoTool
 
 Free = Sequence[str] | Mapping[str, tuple[float, float]]
@@ -72,8 +72,8 @@ def calibrate(
     check_whole("starts", starts, 1)
     check_noise(noise)
     check_rule(scene, scheme, stop)
-    if push is not None and not isinstance(push, Push):
-        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
+    if push is not None:
+        check_push(push)
     groups, seen = _grouped(scene, some)
     labels = _labels(scene, regions)
     ranges, names = _ranges(scene, free, 0 if labels is None else int(labels.max()) + 1)

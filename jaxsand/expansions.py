@@ -4,6 +4,7 @@ import gc
 import heapq
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,9 +32,9 @@ def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[di
     rows = []
     for name, graph, bound in problems:
         tell(f"whole layers and a heap: {name}")
-        first, seconds, found = _median(lambda g=graph, b=bound: layered(g, b), repeats)  # type: ignore[misc]
+        first, seconds, found = _median(partial(layered, graph, bound), repeats)
         heap = heap_misdug if bound is misdug else heap_two_colours
-        _, heap_seconds, (steps, expanded) = _median(lambda g=graph, h=heap: h(g), 3)  # type: ignore[misc]
+        _, heap_seconds, (steps, expanded) = _median(partial(heap, graph), 3)
         if found.steps != steps:
             raise RuntimeError(f"{name}: {found.steps} steps by layers, {steps} by the heap")
         rows.append(

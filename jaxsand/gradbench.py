@@ -19,6 +19,7 @@ from jaxsand.gradcheck import (
     of_float32,
     program,
     relative,
+    sloped,
 )
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Stop, Sweeps, UntilStill
@@ -74,8 +75,7 @@ def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...
             given = inputs(case, cells, batch)
             x = cast(given, jnp.float32)
             run = program(case, cells)
-            slope = jax.value_and_grad(run, (0, 1, 2), has_aux=True)
-            forward, gradient = _compiled(_together(run, together), x), _compiled(_together(slope, together), x)
+            forward, gradient = _compiled(_together(run, together), x), _compiled(_together(sloped(run), together), x)
             best = _race([lambda f=forward, x=x: f[0](*x), lambda f=gradient, x=x: f[0](*x)], rounds)
             taken, allowed = _sweeps(case, cells, given[1], int(jnp.max(forward[0](*x)[1])))
             more = (gradient[2] - forward[2]) / (together * cells**2)

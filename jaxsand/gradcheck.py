@@ -67,7 +67,12 @@ def program(case: Case, cells: int) -> Callable:
 
 def differentiated(run: Callable) -> Callable:
     """`((value, sweeps), gradient)`, of a batch."""
-    return jax.vmap(jax.value_and_grad(run, (0, 1, 2), has_aux=True), in_axes=(0, 0, 0))
+    return jax.vmap(sloped(run))
+
+
+def sloped(run: Callable) -> Callable:
+    """`((value, sweeps), gradient)`, by every input."""
+    return jax.value_and_grad(run, (0, 1, 2), has_aux=True)
 
 
 def inputs(case: Case, cells: int, batch: int, seed: int = 0) -> Inputs:

@@ -194,10 +194,15 @@ def _way(scene: Scene, push: Push) -> Any:
     return _PUSHES[type(scene.tool), type(push)]
 
 
-def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, _Rules]:
-    push = SteppedPush() if push is None else push
+def check_push(push: Any) -> None:
+    """Raises ValueError unless it is a way of pushing."""
     if not isinstance(push, Push):
         raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
+
+
+def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, _Rules]:
+    push = SteppedPush() if push is None else push
+    check_push(push)
     if (type(scene.tool), type(push)) not in _PUSHES:
         other = "SwathPush() is for a Blade" if isinstance(push, SwathPush) else "SplitPush() is for a Wheel"
         raise ValueError(

@@ -137,6 +137,8 @@ def run_all(
     """
     path = out / "strokes.jsonl" if out else None
     known = _known(path) if path else {}
+    if path:
+        _ended(path)
     rows = []
     for goal in some:
         for seed in seeds:
@@ -147,7 +149,7 @@ def run_all(
                 if row is None or not set(budgets) <= set(row["budgets"]):
                     row = want | run_one(method, goal, budgets, seed)
                     if path:
-                        _append(path, row)
+                        _append(path, json.dumps(row))
                 rows.append(_up_to(row, budgets))
     return rows
 
@@ -269,11 +271,15 @@ def _key(row: Row) -> tuple:
     return row["method"], row["goal"], row["seed"], row["strokes"]
 
 
-def _append(path: Path, row: Row) -> None:
-    """Adds a line; one that was cut off before it is ended first."""
-    whole = not path.is_file() or path.read_bytes()[-1:] in (b"", b"\n")
+def _ended(path: Path) -> None:
+    """Ends a last line that was cut off, so that what is added comes on a line of its own."""
+    if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):
+        _append(path, "")
+
+
+def _append(path: Path, line: str) -> None:
     with path.open("a", encoding="utf-8") as file:
-        file.write(("" if whole else "\n") + json.dumps(row) + "\n")
+        file.write(line + "\n")
 
 
 def _known(path: Path) -> dict[tuple, Row]:

@@ -12,11 +12,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
     out = folder(options.out) if options.out else None
     from jaxsand.benchmark import bench, table
 
-    if options.what != "strokes":
-        for option in ("goals", "calls", "seeds", "methods"):
-            if getattr(options, option) is not None:
-                raise ValueError(f"{option}: has an effect on bench strokes only; leave it out")
-    strokes = {} if options.what != "strokes" else _of_strokes(options)
+    strokes = _of_strokes(options)
     report = bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
     if out:
         from jaxsand.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
@@ -51,6 +47,12 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
 
 def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
+    """The options of `bench strokes`, of which other benches have none."""
+    if options.what != "strokes":
+        for option in ("goals", "calls", "seeds", "methods"):
+            if getattr(options, option) is not None:
+                raise ValueError(f"{option}: has an effect on bench strokes only; leave it out")
+        return {}
     return {
         "goals": options.goals or "letters",
         "calls": options.calls or 4_000,

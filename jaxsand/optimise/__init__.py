@@ -24,7 +24,7 @@ from jaxsand.tool import Blade
 _LANES = 4  # plans that go downhill together
 _STEPS = 6  # of Adam on blurred maps
 _REACHED = 1e-4  # of the start's loss: near enough to stop
-_NEARLY = 1.15  # times the least of what sums of prints leave of the squared change
+_NEARLY = 1.15  # times the least that prints leave of the squared change
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import contextlib
 import time
 from collections.abc import Callable
+from functools import partial
 
 from jaxsand.planner.astar import LARGEST, astar
 from jaxsand.planner.board import Board, Problem
@@ -38,11 +39,11 @@ def anytime(problem: Problem, seconds: float) -> Found:
     lower = float(simple_bound(problem))
     expanded = opened = 0
     blocks = Blocks(problem.board)
-    tries: list[Callable[[], Found]] = [lambda width=w: exact(problem, width, tick, blocks) for w in _WIDTHS]  # type: ignore[misc]
+    tries: list[Callable[[], Found]] = [partial(exact, problem, width, tick, blocks) for width in _WIDTHS]
     if problem.turn_cost:
         del tries[2:]
         if len(problem.board.cells) <= LARGEST:
-            tries += [lambda weight=w: astar(problem, 10**9, weight, tick) for w in _WEIGHTS]  # type: ignore[misc]
+            tries += [partial(astar, problem, 10**9, weight, tick) for weight in _WEIGHTS]
     elif len(problem.board.cells) <= LARGEST and any(len(block.cells) > _LOOPY for block in blocks.blocks):
         tries.insert(1, lambda: Found(improved(problem, best, until(_SPARE)), 0, 0, 0))
     for search in tries:
