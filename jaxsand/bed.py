@@ -27,7 +27,7 @@ class Bed:
     spacing: jax.Array  # m, []
     drop: jax.Array  # the largest stable step between straight neighbours, mu dx: [] or [H, W]
     rim: "Rim | None"
-    elsewhere: jax.Array  # the largest |height| outside a block of a map, and of a rim that lies below 0 (m), []
+    elsewhere: jax.Array  # the largest |height| outside a block of a map, or the depth below 0 of a rim (m), []
     neighbours: Neighbours = field(metadata={"static": True})
 
 

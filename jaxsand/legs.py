@@ -64,7 +64,7 @@ def along_legs(
     # Of a path or a tool that is not usable nothing is used; the blade hangs above everything.
     tool = jax.tree.map(lambda leaf: jnp.where(usable, leaf, bed.spacing), scene.tool)
     bottom = jnp.where(usable, lowest(scene.tool), jnp.inf)
-    scale = 4 * (largest(intact) + jnp.where(usable, extent(scene.tool), 0))
+    scale = 4 * (jnp.maximum(largest(intact), bed.elsewhere) + jnp.where(usable, extent(scene.tool), 0))
     flow = Flow(jnp.asarray(rate), quantum(scale))
     job = Job(bed, *centres(scene.grid, height.dtype), tool, bottom, flow)
     lost = nothing_lost(bed, height)

@@ -247,6 +247,16 @@ def test_sand_pushed_over_a_draining_edge_is_counted(dtype):
     assert float(out.drained) == pytest.approx(lost, rel=1e-5)
 
 
+@pytest.mark.parametrize("push", [js.SteppedPush(), js.SwathPush()])
+def test_a_blade_that_skims_level_sand_at_0_leaves_it_to_drain(push):
+    """Nothing but the rim, far below, tells the push how large heights are."""
+    sand = js.make_scene((12, 12), 120.0, ANGLE, tool=js.Blade(300.0, 300.0, 0.0), edge=js.Draining(-240.0))
+    out = js.act(sand, np.zeros((12, 12), np.float32), (300.0, 700.0, 900.0, 500.0), push=push)
+    js.check(out)
+    assert -240 <= float(out.height.min()) <= float(out.height.max()) == 0
+    assert float(out.drained) == pytest.approx(-float(out.height.sum()) * 120.0**2, rel=1e-5)
+
+
 def test_more_sweeps_and_finer_sub_steps_converge():
     """Towards the push so slow that the sand is always at rest, against 64 sweeps to a quarter of a spacing."""
     sand = js.make_scene((48, 48), 0.01, ANGLE, tool=js.Blade(0.05, 0.05, 0.0075))
