@@ -116,7 +116,7 @@ def _bench(commands: Any) -> None:
     p.add_argument(
         "what",
         nargs="?",
-        choices=["settle", "push", "plan", "grad", "sand", "strokes", "trench", "all", "stability", "letters"],
+        choices=["settle", "push", "plan", "grad", "calibrate", "sand", "strokes", "trench", "all", "stability", "letters"],
         default="all",
     )
     p.add_argument(

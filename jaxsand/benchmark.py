@@ -18,7 +18,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import analysis, complexity, expansions, gradbench, piles, rutbench, sandbench, stability, strokebench, workprec
+from jaxsand import (
+    analysis,
+    calibbench,
+    complexity,
+    expansions,
+    gradbench,
+    piles,
+    rutbench,
+    sandbench,
+    stability,
+    strokebench,
+    workprec,
+)
 from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
@@ -51,7 +63,8 @@ def bench(
     seed: int = 0,
     **strokes: Any,
 ) -> dict[str, Any]:
-    """The figures for `what`: settle, push, plan, or all of these; grad, sand, strokes, trench, stability, or letters.
+    """The figures for `what`: settle, push, plan, or all of these; grad, calibrate, sand, strokes, trench, stability,
+    or letters.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
     `batch` is 4096, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`.
@@ -86,6 +99,8 @@ def bench(
         report["sand"] = sandbench.bench_sand(tell, seed=seed)
     if what == "strokes":
         report |= strokebench.bench_strokes(tell, **strokes)
+    if what == "calibrate":
+        report["calibrate"] = calibbench.bench_calibrate(tell)
     if what == "trench":
         report["trench_by_spacing"] = rutbench.against_spacing(tell, grids + 1)
         report["trench_settles"] = rutbench.settling(tell)

@@ -1,28 +1,20 @@
 """Methods that find strokes at equal numbers of simulator calls, on letters and other goals that strokes make."""
 
 import json
-import string
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 
-from jaxsand import goals, task
 from jaxsand.optimise import first, print_of, search
 from jaxsand.optimise.account import Account
 from jaxsand.optimise.moves import reordered
-from jaxsand.rules import UntilStill
-from jaxsand.scene import Scene, make_scene
-from jaxsand.settling import settle
-from jaxsand.shaping import terrain_surface
-from jaxsand.sim import check, rollout
+from jaxsand.strokegoals import GOALS, StrokeGoal
 from jaxsand.strokeloss import Best, SandLoss
 from jaxsand.strokerivals import RIVALS, Found
-from jaxsand.tool import Blade
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]
@@ -31,13 +23,18 @@ BUDGETS = (1_000, 4_000, 16_000, 64_000)
 REACHED = 0.8
 """The IoU of dug cells from which a goal counts as reached."""
 
-_CELLS, _SPACING = 32, 0.01
-
 
 def by_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
     """What `optimise_strokes` does."""
     account = Account(sand, budget)
     search(account, n_strokes, np.random.default_rng(seed))
+    return Found(account.best.strokes, account.calls, account.history)
+
+
+def number_open(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+    """What `optimise_strokes` does when it is not told how many strokes there are."""
+    account = Account(sand, budget)
+    search(account, None, np.random.default_rng(seed))
     return Found(account.best.strokes, account.calls, account.history)
 
 
@@ -56,70 +53,12 @@ def without_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget
     return Found(account.best.strokes, account.calls, account.history)
 
 
-METHODS: dict[str, Method] = {"gradients": by_gradients, "sketch and mutations": without_gradients, **RIVALS}
-
-
-@dataclass(frozen=True)
-class StrokeGoal:
-    """What `strokes` [N, 4] (m) leave of `start` [H, W] (m); a search is told the start, the goal and N."""
-
-    name: str
-    scene: Scene
-    start: np.ndarray
-    goal: np.ndarray
-    strokes: np.ndarray
-
-    def iou(self, after: np.ndarray) -> float:
-        """Of what is dug below the start."""
-        tool = self.scene.tool
-        depth = float(tool.depth) if isinstance(tool, Blade) else 0.0
-        return float(task.iou(self.goal - self.start, after - self.start, depth))
-
-
-def stroke_goal(name: str, strokes: np.ndarray, start: np.ndarray | None = None) -> StrokeGoal:
-    """The goal that strokes (m) leave on a map of 32 x 32 cells of 0.01 m at rest (level if None), by the default blade."""
-    scene = make_scene((_CELLS, _CELLS), _SPACING, tool=Blade())
-    start = np.zeros(scene.grid.shape, np.float32) if start is None else np.asarray(start, np.float32)
-    shaped = rollout(scene, start, np.asarray(strokes, np.float32))
-    check(shaped)
-    return StrokeGoal(name, scene, start, np.asarray(shaped.height[-1]), np.asarray(strokes, float))
-
-
-def letters(names: str = string.ascii_uppercase) -> list[StrokeGoal]:
-    """Capital letters on level sand."""
-    return [stroke_goal(name, task.place(goals.letter_strokes(name))) for name in names]
-
-
-def turned_letters(names: str = string.ascii_uppercase, degrees: float = 30.0) -> list[StrokeGoal]:
-    """Letters turned about the middle of the map, counter-clockwise, and made smaller where they would leave it."""
-    angle = np.radians(degrees)
-    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    out = []
-    for name in names:
-        points = (goals.letter_strokes(name).reshape(-1, 2) - 0.5) @ turn
-        points *= min(1.0, 0.5 / np.abs(points).max())
-        out.append(stroke_goal(f"{name} turned by {degrees:g}", task.place((points + 0.5).reshape(-1, 4))))
-    return out
-
-
-def letters_on_rough_sand(names: str = string.ascii_uppercase, relief: float = 0.01) -> list[StrokeGoal]:
-    """Letters pushed into terrain of a height range `relief` (m)."""
-    scene = make_scene((_CELLS, _CELLS), _SPACING)
-    rested = settle(scene, terrain_surface(scene.grid.shape, relief).astype(np.float32), stop=UntilStill(bound=200_000))
-    check(rested)
-    rough = np.asarray(rested.height)
-    return [stroke_goal(f"{name} on rough sand", task.place(goals.letter_strokes(name)), rough) for name in names]
-
-
-def many_strokes(count: int = 8, goals: int = 5, seed: int = 0) -> list[StrokeGoal]:
-    """Goals of random strokes inside the square of the glyphs, each at least a quarter of it long."""
-    rng = np.random.default_rng(seed)
-    out = []
-    for k in range(goals):
-        drawn = rng.random((64 * count, 4))
-        long = drawn[np.hypot(*(drawn[:, 2:] - drawn[:, :2]).T) >= 0.25][:count]
-        out.append(stroke_goal(f"{count} strokes, {k + 1}", task.place(long)))
-    return out
+METHODS: dict[str, Method] = {
+    "gradients": by_gradients,
+    "gradients with N open": number_open,
+    "sketch and mutations": without_gradients,
+    **RIVALS,
+}
 
 
 def run_all(
@@ -204,14 +143,6 @@ def at_budget(rows: list[Row], budget: int) -> list[tuple[Row, Row]]:
     return [(row, at) for row in rows for at in row["at"] if at["budget"] == budget]
 
 
-GOALS: dict[str, Callable[[], list[StrokeGoal]]] = {
-    "letters": letters,
-    "turned": turned_letters,
-    "rough": letters_on_rough_sand,
-    "eight": many_strokes,
-}
-
-
 def bench_strokes(
     tell: Tell = lambda _: None,
     goals: str = "letters",
@@ -252,9 +183,12 @@ def found(goals: str, rows: list[Row]) -> list[tuple[str, float, np.ndarray, np.
 
 
 def _line(row: Row) -> Row:
-    return {key: row[key] for key in ("method", "goal", "strokes", "seed")} | {
-        f"iou_at_{at['budget']}": at["iou"] for at in row["at"]
-    }
+    found = {f"strokes_at_{at['budget']}": len(at["plan"] or ()) for at in row["at"]}
+    return (
+        {key: row[key] for key in ("method", "goal", "strokes", "seed")}
+        | found
+        | {f"iou_at_{at['budget']}": at["iou"] for at in row["at"]}
+    )
 
 
 def _up_to(row: Row, budgets: tuple[int, ...]) -> Row:

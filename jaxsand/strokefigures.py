@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def strokes_figure(rows: list[dict[str, Any]]) -> "Figure":
-    """Against the simulator's calls: how many runs reach IoU 0.8, and the l2 reduction (median, and quartiles shaded)."""
+def strokes_figure(rows: list[dict[str, Any]], reached: float) -> "Figure":
+    """Against the simulator's calls: how many runs have the IoU `reached`, and the l2 reduction (median, quartiles)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4), layout="constrained")
@@ -17,7 +17,7 @@ def strokes_figure(rows: list[dict[str, Any]]) -> "Figure":
     for k, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
         mine, colour = [row for row in rows if row["method"] == method], f"C{k}"
         budgets = sorted({budget for row in mine for budget in row["budgets"]})
-        share = [np.mean([at["iou"] >= 0.8 for row in mine for at in row["at"] if at["budget"] == b]) for b in budgets]
+        share = [np.mean([at["iou"] >= reached for row in mine for at in row["at"] if at["budget"] == b]) for b in budgets]
         counts.plot(budgets, share, "o-", ms=4, color=colour, label=method)
         calls = np.geomspace(min(50, budgets[-1]), budgets[-1], 100)
         ends = np.array([_held(row["curve"], calls, max(row["budgets"])) for row in mine])
@@ -26,7 +26,7 @@ def strokes_figure(rows: list[dict[str, Any]]) -> "Figure":
         curves.plot(calls[some], middle, color=colour, label=method)
         curves.fill_between(calls[some], low, high, color=colour, alpha=0.15, lw=0)
     counts.set(xscale="log", xlabel="calls of the simulator", ylim=(-0.03, 1.03))
-    counts.set_title("share of runs with an IoU of 0.8", loc="left")
+    counts.set_title(f"share of runs with an IoU of {reached:g}", loc="left")
     curves.set(xscale="log", xlabel="calls of the simulator", ylim=(-0.3, 1.03))
     curves.set_title("l2 reduction, median and quartiles", loc="left")
     counts.legend(frameon=False, fontsize=8)

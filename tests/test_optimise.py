@@ -12,7 +12,7 @@ from jaxsand.optimise import as_many_as_pay, print_of, search
 from jaxsand.optimise.account import Account
 from jaxsand.optimise.moves import reordered
 from jaxsand.optimise.sketch import guesses, printed, prints
-from jaxsand.strokebench import letters, many_strokes, stroke_goal
+from jaxsand.strokegoals import letters, many_strokes, stroke_goal
 from jaxsand.strokeloss import GRADIENT, SandLoss
 
 

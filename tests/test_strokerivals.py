@@ -10,8 +10,9 @@ from jaxsand import strokebench
 from jaxsand.__main__ import main
 from jaxsand.rules import Outcome
 from jaxsand.sim import rollout
-from jaxsand.strokebench import letters_on_rough_sand, many_strokes, reached, run_all, stroke_goal, turned_letters
+from jaxsand.strokebench import reached, run_all
 from jaxsand.strokefigures import strokes_figure
+from jaxsand.strokegoals import letters_on_rough_sand, many_strokes, stroke_goal, turned_letters
 from jaxsand.strokeloss import SandLoss, _by_length
 from jaxsand.strokerivals import RIVALS, random_shooting
 from jaxsand.window import Window
@@ -143,7 +144,7 @@ def test_the_bench_writes_what_it_computes_and_does_not_compute_it_again(bar, tm
     assert line["method"] == "random shooting"
     assert line["goals"] == 1
     assert line["reached_at_16"] in (0, 1)
-    assert len(strokes_figure(rows).axes) == 2
+    assert len(strokes_figure(rows, 0.8).axes) == 2
 
 
 def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch):

@@ -31,11 +31,11 @@ def run_benchmark(options: argparse.Namespace) -> None:
             with written(out / "bench-trench.png") as path:
                 save_figure(spacing_figure(report["trench_by_spacing"]), path)
         if "strokes_curves" in report:
-            from jaxsand.strokebench import found
+            from jaxsand.strokebench import REACHED, found
             from jaxsand.strokefigures import found_figure, strokes_figure
 
             with written(out / "bench-strokes.png") as path:
-                save_figure(strokes_figure(report["strokes_curves"]), path)
+                save_figure(strokes_figure(report["strokes_curves"], REACHED), path)
             shown = found(strokes["goals"], report["strokes_curves"])
             if shown:
                 with written(out / "bench-strokes-found.png") as path:

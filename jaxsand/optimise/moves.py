@@ -10,7 +10,7 @@ import numpy as np
 import optax
 
 from jaxsand.optimise.account import Account
-from jaxsand.optimise.sketch import Print, guesses
+from jaxsand.optimise.sketch import Print, guesses, swaps
 
 Plans = tuple[np.ndarray, np.ndarray]  # [P, N, 4] (m), closest first, and their losses [P] (m^2)
 _STEPS = (1.0, 0.3, 0.1, 0.03)  # lengths that a quasi-Newton step is tried at
@@ -78,7 +78,7 @@ def reordered(account: Account, start: Plans) -> Plans:
     plans, losses = start
     while True:
         plan, n = plans[0], plans.shape[1]
-        others = [plan[[*range(i), j, *range(i + 1, j), i, *range(j + 1, n)]] for i in range(n) for j in range(i + 1, n)]
+        others = list(plan[swaps(n)])
         for k in range(n):
             turned = plan.copy()
             turned[k] = plan[k, [2, 3, 0, 1]]

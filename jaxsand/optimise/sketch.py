@@ -90,17 +90,21 @@ def _bell(blur: float) -> np.ndarray:
 
 def _reordered(mark: Print, plans: jax.Array, strokes: int, start: jax.Array, goal: jax.Array) -> jax.Array:
     """Every plan with two strokes swapped, as long as that brings its prints closer."""
-    pairs = [(i, j) for i in range(strokes) for j in range(i + 1, strokes)]
-    orders = np.tile(np.arange(plans.shape[1]), (len(pairs) + 1, 1))
-    for k, (i, j) in enumerate(pairs):
-        orders[k, [i, j]] = j, i
+    orders = np.tile(np.arange(plans.shape[1]), (strokes * (strokes - 1) // 2 + 1, 1))
+    orders[:-1, :strokes] = swaps(strokes)
     for _ in range(strokes):
         far = _far_in_orders(mark, plans, jnp.asarray(orders), start, goal)
-        best = orders[np.argmin(np.asarray(far) + 1e-6 * np.arange(len(pairs) + 1)[::-1], axis=1)]
+        best = orders[np.argmin(np.asarray(far) + 1e-6 * np.arange(len(orders))[::-1], axis=1)]
         if (best == orders[-1]).all():
             break
         plans = jnp.take_along_axis(plans, jnp.asarray(best)[..., None], axis=1)
     return plans
+
+
+def swaps(count: int) -> np.ndarray:
+    """The orders [pairs, count] of so many strokes in which two have changed places."""
+    orders = [[*range(i), j, *range(i + 1, j), i, *range(j + 1, count)] for i in range(count) for j in range(i + 1, count)]
+    return np.array(orders, int).reshape(-1, count)
 
 
 def _matched(mark: Print, start: np.ndarray, goal: np.ndarray, strokes: int, rng: np.random.Generator) -> np.ndarray:
