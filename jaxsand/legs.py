@@ -144,5 +144,5 @@ def in_window(scene: Scene, job: Job, pose: Pose, state: State, move: Callable) 
     start = origin(window, shape, (pose.y / dx, pose.x / dx))
     old, old_lost = cut(window, shape, start, (h, lost))
     new, new_lost, cover = move(cut(window, shape, start, job), old, old_lost)
-    moved = jnp.maximum(moved, edge_movement(window, shape, start, old, new, cover) / dx)
+    moved = jnp.maximum(moved, edge_movement(window, shape, start, old, new, cover) / lax.stop_gradient(dx))
     return paste(start, h, new), paste(start, lost, new_lost), moved

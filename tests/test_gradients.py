@@ -135,3 +135,11 @@ def test_the_loop_stops_where_told_and_is_differentiated_as_its_steps(bound):
     assert np.allclose(
         jax.vmap(jax.grad(lambda x: looped(p, x)[0]))(xs), [jax.grad(lambda x: looped(p, x)[0])(v) for v in xs], rtol=1e-12
     )
+
+
+def test_a_blade_at_the_edge_of_its_window_has_a_finite_derivative_by_the_spacing():
+    def pushed(dx):
+        scene = js.make_scene((12, 12), dx, tool=js.Blade(0.05, 0.05, 0.0075), window=js.Window((4, 4)))
+        return jnp.sum(js.act(scene, jnp.zeros((12, 12)), jnp.array([0.03, 0.06, 0.08, 0.07])).height)
+
+    assert jnp.isfinite(jax.grad(pushed)(0.01))
