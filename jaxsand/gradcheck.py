@@ -104,9 +104,10 @@ def against_differences(
     Differences are taken in a normally distributed direction of one input at a time, so that the error is what the
     gradient by that input is off by, in the mean square. Lengths count in spacings, angles in rad.
 
-    Kinks are kept away from, and of the gradient no more is asked than its norm: of a few steps the one is taken at which
-    the one-sided differences agree best, and a point is smooth if these are at most `APART` apart (a kink between the two
-    ends shifts the central difference by half of that) and settling takes the same number of sweeps there and at both ends.
+    Kinks are kept away from, and of the gradient no more is asked than its norm. A point is smooth if at two steps in a row
+    the one-sided differences are at most `APART` apart (a kink between the two ends shifts the central difference by half of
+    that; kinks on both sides that make up for each other at one step do not at the next) and settling takes the same number
+    of sweeps there and at both ends. Of such pairs that which agrees best gives the difference.
     """
     chunk = chunk or points
     parts = [_differences(case, cells, chunk, seed + 1000 * k) for k in range(-(-points // chunk))]
@@ -123,15 +124,16 @@ def _differences(case: Case, cells: int, batch: int, seed: int) -> tuple[np.ndar
         error, smooth = [], []
         for k, unit in enumerate(_UNITS):
             way = rng.standard_normal(x[k].shape)
-            apart, central = np.full(batch, np.inf), np.zeros(batch)
+            apart, central, last = np.full(batch, np.inf), np.zeros(batch), np.full(batch, np.inf)
             for size in STEPS:
                 (up, n), (down, m) = (
                     _forward(case, cells)(*x[:k], x[k] + sign * size * unit * way, *x[k + 1 :]) for sign in (1, -1)
                 )
                 now = np.abs(up - 2 * value + down) / (size * norm)
                 now = np.where((n == sweeps) & (m == sweeps), now, np.inf)
-                central = np.where(now < apart, (up - down) / (2 * size), central)
-                apart = np.minimum(apart, now)
+                both = np.maximum(now, last)
+                central = np.where(both < apart, (up - down) / (2 * size), central)
+                apart, last = np.minimum(apart, both), now
             own = unit * np.asarray(gradient[k] * way).reshape(batch, -1).sum(1)
             error.append(np.abs(own - central) / norm)
             smooth.append(apart <= APART)
