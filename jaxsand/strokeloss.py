@@ -106,6 +106,10 @@ class SandLoss:
         high = np.array([columns - 1, rows - 1, columns - 1, rows - 1]) * float(self.scene.grid.spacing)
         return np.stack([np.zeros(4), high])
 
+    def loss_of(self, height: np.ndarray) -> float:
+        """The squared distance (m^2) of a map [H, W] (m) from the goal."""
+        return float(self._loss(height))
+
     def _loss(self, maps: np.ndarray) -> np.ndarray:
         square = ((maps.astype(float) - self.goal) ** 2).sum((-2, -1))
         return np.where(np.isnan(square), np.inf, square)

@@ -62,6 +62,7 @@ def optimise_strokes(
     budget: int = 4_000,
     most: int = 8,
     smoothing: Blurred | None = Blurred(),
+    guess: jax.typing.ArrayLike | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> Optimised:
     """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
@@ -70,6 +71,8 @@ def optimise_strokes(
     ten-thousandth of the start's loss, or after `budget` simulator calls. Where nothing is to change, or nothing was found
     that brings the sand closer than it was, there are no strokes. The same key finds the same plan on the same machine. Not
     differentiable itself. The first call for a shape of map compiles, for about half a minute on two cores.
+
+    Given a `guess` [N, 4] (m), such as a policy's plan, it starts from that instead of from a sketch.
 
     Raises:
       ValueError: for a scene without a blade, a start or goal of another shape, or a key or count out of range.
@@ -88,12 +91,15 @@ def optimise_strokes(
     )
     rng = np.random.default_rng(_entropy(key))
     account = Account(sand, budget, tell)
-    if account.before > 0:
+    plan = None if guess is None else _plan(guess, strokes)
+    if account.before > 0 and plan is None:
         search(account, strokes, rng, most, smoothing)
+    elif account.before > 0 and plan is not None and len(plan):
+        improve(account, print_of(account), (plan[None], account.losses(plan[None])), rng, smoothing)
     steps = [Best(0, account.before, np.zeros((0, 4))), *(best for best in account.history if best.loss < account.before)]
-    plan = steps[-1].strokes
-    height = sand.maps(plan[None])[0]
-    return Optimised(plan, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), account.calls, height)
+    found = steps[-1].strokes
+    height = sand.maps(found[None])[0]
+    return Optimised(found, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), account.calls, height)
 
 
 def search(
@@ -170,6 +176,13 @@ def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Ge
 
 def _joined(a: moves.Plans, b: moves.Plans) -> moves.Plans:
     return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
+
+
+def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:
+    plan = np.asarray(as_array("guess", guess), float)
+    if plan.ndim != 2 or plan.shape[1] != 4 or strokes not in (None, len(plan)) or not np.isfinite(plan).all():
+        raise ValueError(f"guess: got shape {list(plan.shape)}; give [{strokes or 'N'}, 4], finite x0, y0, x1, y1 in metres")
+    return plan
 
 
 def _entropy(key: jax.Array | int) -> np.ndarray:

@@ -22,7 +22,7 @@ class Account:
     @property
     def before(self) -> float:
         """The loss of the start (m^2)."""
-        return float(((self.sand.start.astype(float) - self.sand.goal) ** 2).sum())
+        return self.sand.loss_of(self.sand.start)
 
     @property
     def best(self) -> Best:

@@ -1,0 +1,40 @@
+"""When what strokes left counts as the goal that a glyph's own strokes leave."""
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+from scipy.optimize import linear_sum_assignment
+
+from jaxsand.task import GLYPH_SQUARE, dug, iou, l2
+
+_NEAR = 0.9  # of the dug cells of either map lie beside a dug cell of the other
+_CLOSE = 0.12  # of a glyph's size between ends of strokes that count as the same
+
+
+def right(goal: np.ndarray, height: np.ndarray, depth: float) -> bool:
+    """Of the dug cells of each map [H, W] at least 90% lie within one cell (8 neighbours) of a dug cell of the other.
+
+    Dug is what is lower than half the trench depth (m).
+    """
+    a, b = np.asarray(dug(goal, depth)), np.asarray(dug(height, depth))
+    return _beside(a, b) >= _NEAR and _beside(b, a) >= _NEAR
+
+
+def strict(goal: np.ndarray, start: np.ndarray, height: np.ndarray, depth: float) -> bool:
+    """An IoU of dug cells of 0.8 or more, and at most a tenth of the squared l2 distance of the start left."""
+    far, left = (float(l2(goal, h)) ** 2 for h in (start, height))
+    return float(iou(goal, height, depth)) >= 0.8 and left <= 0.1 * far
+
+
+def strokes_right(strokes: np.ndarray, pushes: np.ndarray, size: float = GLYPH_SQUARE[1] - GLYPH_SQUARE[0]) -> int:
+    """How many of a glyph's strokes [N, 4] (m) one of the pushes [M, 4] (m) made: both its ends within 12% of the glyph's
+    `size` (m) of the push's, in either direction, each push for one stroke."""
+    strokes, pushes = (np.asarray(x, float).reshape(-1, 1, 2, 2) for x in (strokes, pushes))
+    pushes = pushes[:, 0][None]
+    ways = [np.linalg.norm(strokes - p, axis=-1).max(-1) for p in (pushes, pushes[:, :, ::-1])]
+    same = np.minimum(*ways) <= _CLOSE * size
+    return int(same[linear_sum_assignment(same, maximize=True)].sum())
+
+
+def _beside(a: np.ndarray, b: np.ndarray) -> float:
+    """The share of the cells of `a` within one cell of `b`; 1 where it has none."""
+    return float((a & maximum_filter(b, 3)).sum() / a.sum()) if a.any() else 1.0
