@@ -1,5 +1,6 @@
 """When what strokes left counts as the goal that a glyph's own strokes leave."""
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.optimize import linear_sum_assignment
@@ -21,7 +22,7 @@ def right(goal: np.ndarray, height: np.ndarray, depth: float) -> bool:
 
 def strict(goal: np.ndarray, start: np.ndarray, height: np.ndarray, depth: float) -> bool:
     """An IoU of dug cells of 0.8 or more, and at most a tenth of the squared l2 distance of the start left."""
-    far, left = (float(l2(goal, h)) ** 2 for h in (start, height))
+    far, left = (float(l2(jnp.asarray(goal), jnp.asarray(h))) ** 2 for h in (start, height))
     return float(iou(goal, height, depth)) >= 0.8 and left <= 0.1 * far
 
 

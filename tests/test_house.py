@@ -24,9 +24,9 @@ FLOORS = [
     {"push", "swath", "trench"},
     {"roll", "split"},
     {"sim"},
-    {"task", "goals", "planner", "plain", "scans", "calibration", "sections"},
-    {"strokeloss"},
-    {"sandplan", "optimise"},
+    {"task", "goals", "planner", "plain", "scans", "calibration", "sections", "strokenet"},
+    {"strokeloss", "success", "policy"},
+    {"sandplan", "optimise", "lookahead"},
     {"shaping", "files", "rut", "strokerivals", "gradcheck"},
     {
         "workprec",

@@ -1,0 +1,244 @@
+"""The network of the policy that comes with jaxsand: from a goal and the sand to the strokes that are still to be made.
+
+A U-Net looks at both maps and gives, for every cell, how likely a stroke that is due starts there, and a query and a key: a
+stroke from cell s ends at cell e with a likelihood in proportion to exp(query(s) . key(e)), so that all pairs of cells are
+compared at once. Ends that belong to strokes are easy to see; which belong together is seen along the line between them, and
+so a second, small network reads what the first makes of the cells on the way and says whether a stroke is due there.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+Params = Any
+
+_STARTS = 32  # peaks of the starts
+_ENDS = 12  # peaks of the ends from each
+_TRUST = 0.3  # in the likelihoods of ends, beside what is seen along the line
+_ALONG = 12  # places that are looked at from end to end
+_BEYOND = 1.5  # cells: and one before and one behind
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Scores:
+    """What the network says of every cell: the log-likelihood that a stroke `start`s there [B, H, W], the `query` and the
+    `key` [B, H, W, K] by which starts find their ends, and what lines see there, `sight` [B, V, H, W, C] in V views."""
+
+    start: jax.Array
+    query: jax.Array
+    key: jax.Array
+    sight: jax.Array
+
+
+class _Block(nn.Module):
+    """Two convolutions beside a shortcut."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        y = nn.Conv(self.width, (3, 3))(nn.relu(nn.LayerNorm()(x)))
+        y = nn.Conv(self.width, (3, 3), kernel_init=nn.initializers.zeros)(nn.relu(y))
+        return x + y
+
+
+class _Look(nn.Module):
+    """A U-Net on blocks of 2 x 2 cells, so that most of its work is done on a quarter of the cells and fewer."""
+
+    widths: tuple[int, int, int]
+    blocks: tuple[int, int, int]
+    features: int
+    sights: int
+
+    @nn.compact
+    def __call__(self, goal: jax.Array, current: jax.Array) -> Scores:
+        rows, columns = goal.shape[1:]
+        y, x = jnp.meshgrid(jnp.linspace(-1, 1, rows), jnp.linspace(-1, 1, columns), indexing="ij")
+        place = [jnp.broadcast_to(v, goal.shape) for v in (x, y)]
+        raw = jnp.stack([goal, current, goal - current], -1)
+        x = _folded(jnp.concatenate([raw, jnp.stack(place, -1)], -1), 2)
+        x = nn.Conv(self.widths[0], (3, 3))(x)
+        aside = []
+        for level, (width, blocks) in enumerate(zip(self.widths, self.blocks, strict=True)):
+            if level:
+                aside.append(x)
+                x = nn.Conv(width, (2, 2), (2, 2))(x)
+            for _ in range(blocks):
+                x = _Block(width)(x)
+        for width, blocks, skip in zip(self.widths[1::-1], self.blocks[1::-1], aside[::-1], strict=True):
+            x = _unfolded(nn.Dense(4 * width)(x), 2) + nn.Dense(width)(skip)
+            for _ in range(blocks):
+                x = _Block(width)(x)
+        x = nn.relu(nn.LayerNorm()(x))
+        x = _unfolded(nn.Dense(4 * (1 + 2 * self.features + self.sights))(x), 2)
+        start, query, key, sight = jnp.split(x, [1, 1 + self.features, 1 + 2 * self.features], -1)
+        sight = jnp.concatenate([sight, raw], -1)
+        return Scores(_log_share(start[..., 0]), query / math.sqrt(self.features), key, sight[:, None])
+
+
+class _Line(nn.Module):
+    """From what is seen along lines [..., L, C] to the log-odds [...] that a stroke is due there."""
+
+    @nn.compact
+    def __call__(self, seen: jax.Array) -> jax.Array:
+        x = nn.relu(nn.Dense(64)(seen.reshape(*seen.shape[:-2], -1)))
+        return nn.Dense(1)(nn.relu(nn.Dense(32)(x)))[..., 0]
+
+
+class StrokeNet(nn.Module):
+    """Both networks. Maps are [B, H, W] in units of the blade's depth, H and W multiples of 8; strokes are in cells, cell
+    centres at whole numbers and a half. It was trained on 32 x 32 cells."""
+
+    widths: tuple[int, int, int] = (32, 64, 96)
+    blocks: tuple[int, int, int] = (1, 2, 2)
+    features: int = 16
+    sights: int = 12
+
+    def setup(self) -> None:
+        self.eye = _Look(self.widths, self.blocks, self.features, self.sights)
+        self.line = _Line()
+
+    def __call__(self, goal: jax.Array, current: jax.Array, strokes: jax.Array) -> tuple[Scores, jax.Array]:
+        scores = self.eye(goal, current)
+        return scores, self.due(scores, strokes)
+
+    def look(self, goal: jax.Array, current: jax.Array) -> Scores:
+        return self.eye(goal, current)
+
+    def due(self, scores: Scores, strokes: jax.Array) -> jax.Array:
+        """The log-odds [B, P] that strokes [B, P, 4] (cells) are due; the mean of all views."""
+        return self.line(seen_along(scores.sight, strokes)).mean(1)
+
+
+def seen_along(sight: jax.Array, strokes: jax.Array) -> jax.Array:
+    """What lies along strokes [B, P, 4] (cells), bilinear, from a little before to a little behind: [B, V, P, L, C]."""
+    a, b = strokes[..., None, :2], strokes[..., None, 2:]
+    ahead = (b - a) / jnp.maximum(jnp.linalg.norm(b - a, axis=-1, keepdims=True), 1e-6)
+    part = jnp.linspace(0, 1, _ALONG)[:, None]
+    points = jnp.concatenate([a - _BEYOND * ahead, a + part * (b - a), b + _BEYOND * ahead], -2)
+    batch, views, rows, columns, channels = sight.shape
+    at = jnp.clip(points - 0.5, 0, jnp.array([columns - 1.001, rows - 1.001]))
+    low = jnp.floor(at).astype(jnp.int32)
+    part = at - low
+    flat = sight.reshape(batch, views, rows * columns, channels)
+    out = jnp.zeros((batch, views, *points.shape[1:3], channels), sight.dtype)
+    for i in (0, 1):
+        for j in (0, 1):
+            cell = (low[..., 1] + i) * columns + low[..., 0] + j
+            weight = jnp.abs(1 - i - part[..., 1]) * jnp.abs(1 - j - part[..., 0])
+            value = jax.vmap(lambda maps, cell: maps[:, cell])(flat, cell)
+            out = out + weight[:, None, ..., None] * value
+    return out
+
+
+def _folded(x: jax.Array, n: int) -> jax.Array:
+    """Blocks of n x n cells as one with n^2 times as many channels."""
+    b, h, w, c = x.shape
+    return x.reshape(b, h // n, n, w // n, n, c).transpose(0, 1, 3, 2, 4, 5).reshape(b, h // n, w // n, n * n * c)
+
+
+def _unfolded(x: jax.Array, n: int) -> jax.Array:
+    b, h, w, c = x.shape
+    c //= n * n
+    return x.reshape(b, h, w, n, n, c).transpose(0, 1, 3, 2, 4, 5).reshape(b, h * n, w * n, c)
+
+
+def _log_share(score: jax.Array) -> jax.Array:
+    """Scores [..., H, W] as logarithms of shares of 1."""
+    return score - jax.nn.logsumexp(score, (-2, -1), keepdims=True)
+
+
+def spread(points: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """Points [..., 2] = x, y (cells) as shares of the cells around: [..., H, W]."""
+    rows, columns = shape
+    x = jnp.clip(points[..., 0, None] - 0.5, 0, columns - 1)
+    y = jnp.clip(points[..., 1, None] - 0.5, 0, rows - 1)
+    across = jnp.maximum(1 - jnp.abs(x - jnp.arange(columns)), 0)
+    along = jnp.maximum(1 - jnp.abs(y - jnp.arange(rows)), 0)
+    return along[..., :, None] * across[..., None, :]
+
+
+def ends(scores: Scores, starts: jax.Array) -> jax.Array:
+    """Log-likelihoods [B, R, H, W] of the ends of strokes that start at points [B, R, 2] (cells)."""
+    shares = spread(starts, (scores.start.shape[1], scores.start.shape[2]))
+    query = jnp.einsum("brij,bijk->brk", shares, scores.query)
+    return _log_share(jnp.einsum("brk,bijk->brij", query, scores.key))
+
+
+def symmetric(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Array) -> Scores:
+    """The network's scores of square maps, averaged (as logarithms) over the eight turns and mirrors of a square."""
+
+    def one(way: int) -> Scores:
+        def turned(x: jax.Array) -> jax.Array:
+            x = jnp.flip(x, [axis for axis in (1, 2) if way >> axis & 1])
+            return x.swapaxes(1, 2) if way & 1 else x
+
+        def back(x: jax.Array, first: int = 1) -> jax.Array:
+            x = x.swapaxes(first, first + 1) if way & 1 else x
+            return jnp.flip(x, [axis + first - 1 for axis in (1, 2) if way >> axis & 1])
+
+        scores: Any = net.apply(params, turned(goal), turned(current), method="look")
+        return Scores(back(scores.start), back(scores.query), back(scores.key), back(scores.sight, 2))
+
+    every = [one(way) for way in range(8)]
+    start = _log_share(sum((s.start for s in every), jnp.zeros_like(every[0].start)) / 8)
+    query, key = jnp.concatenate([s.query for s in every], -1) / 8, jnp.concatenate([s.key for s in every], -1)
+    return Scores(start, query, key, jnp.concatenate([s.sight for s in every], 1))
+
+
+def likeliest(due: Callable[[Scores, jax.Array], jax.Array], scores: Scores, count: int) -> tuple[jax.Array, jax.Array]:
+    """The `count` likeliest strokes [B, count, 4] (cells), none like another, and their scores [B, count]:
+
+        log sigmoid(due) + 0.3 [log p(start) + log p(end | start)],
+
+    with p of the blocks of 3 x 3 cells around peaks. A stroke's ends are the means of the likelihoods in their blocks.
+    """
+    strokes, log_shares = jax.lax.map(_candidates, scores)
+    score = jax.nn.log_sigmoid(due(scores, strokes)) + _TRUST * log_shares
+
+    def pick(strokes: jax.Array, score: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def one(score: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+            best = jnp.argmax(score)
+            like = jnp.max(jnp.abs(strokes - strokes[best]), -1) < 1.5
+            return jnp.where(like, score - 1e3, score), (strokes[best], score[best])
+
+        return jax.lax.scan(one, score, None, length=count)[1]
+
+    return jax.vmap(pick)(strokes, score)
+
+
+def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
+    """Strokes between peaks, of one map: [S E, 4] (cells), and the logarithms of their likelihoods."""
+    rows, columns = scores.start.shape
+    query, key = (x.reshape(rows * columns, -1) for x in (scores.query, scores.key))
+    begin = jnp.exp(scores.start)
+    p, first = _peaks(begin, _STARTS)
+    end = jnp.exp(_log_share((query[first] @ key.T).reshape(-1, rows, columns)))
+    q, last = jax.vmap(lambda share: _peaks(share, _ENDS))(end)
+    a = jax.vmap(lambda cell: _centre(begin, cell))(first)
+    b = jax.vmap(lambda share, cells: jax.vmap(lambda cell: _centre(share, cell))(cells))(end, last)
+    strokes = jnp.concatenate([jnp.broadcast_to(a[:, None], b.shape), b], -1)
+    both = jnp.log(jnp.maximum(p, 1e-9))[:, None] + jnp.log(jnp.maximum(q, 1e-9))
+    return strokes.reshape(-1, 4), both.ravel()
+
+
+def _peaks(share: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
+    """The sums over the blocks of 3 x 3 cells around the largest peaks of these sums, and the peaks' cells."""
+    block = jax.lax.reduce_window(share, 0.0, jax.lax.add, (3, 3), (1, 1), "SAME")
+    peak = block >= jax.lax.reduce_window(block, -jnp.inf, jax.lax.max, (3, 3), (1, 1), "SAME")
+    return jax.lax.top_k(jnp.where(peak, block, 0).ravel(), count)
+
+
+def _centre(share: jax.Array, cell: jax.Array) -> jax.Array:
+    """The mean place x, y (cells) of the shares [H, W] in the block around a cell."""
+    rows, columns = share.shape
+    y, x = jnp.meshgrid(jnp.arange(rows), jnp.arange(columns), indexing="ij")
+    near = (jnp.abs(y - cell // columns) <= 1) & (jnp.abs(x - cell % columns) <= 1)
+    weight = jnp.where(near, share, 0) + jnp.where(near, 1e-12, 0)
+    return jnp.stack([jnp.sum(weight * (x + 0.5)), jnp.sum(weight * (y + 0.5))]) / jnp.sum(weight)

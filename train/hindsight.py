@@ -1,0 +1,223 @@
+"""Hindsight imitation: a network that is shown a goal which random strokes made, and sand on the way there, learns which
+strokes are still to come.
+
+Hindsight makes every plan of random strokes a success to learn from (goal-conditioned supervised learning, Ghosh et al.
+2019), and no reward is needed. With s the starts and e the ends of the n strokes due, all as good as each other,
+
+    loss = -1/n sum_r [log p(s_r) + log p(e_r | s_r)] + the logistic loss of pairs of ends (is such a stroke due or not).
+
+From some time on half of the lessons come from its own strokes (as in DAgger, Ross et al. 2011), so that it learns to go on
+from its mistakes. No letter is ever seen.
+"""
+
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxsand.lookahead import one_after_the_other
+from jaxsand.policy import Policy
+from jaxsand.scene import Scene
+from jaxsand.strokenet import Scores, StrokeNet, ends, likeliest, spread
+from jaxsand.success import right, strokes_right
+from jaxsand.tool import Blade
+from train.lessons import Lessons, lessons, way
+from train.plans import MOST, random_plans
+from train.sand import CELLS, SPACING, other_scene, starts, usual_scene
+
+_WEIGHT = 2.0  # of the loss of pairs
+_SAME, _OTHER = 1.0, 2.5  # cells: nearer than that to a due stroke is one, farther is none
+_SET_APART = 1_000_003  # the seed of the goals that it is validated on
+_TRIALS = 128  # such goals
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Progress:
+    """The network's `params`, their moving `average` (which acts), the optimiser's state, and the chunks done."""
+
+    params: Any
+    average: Any
+    optimiser: Any
+    chunk: jax.Array
+    seed: jax.Array
+
+
+@dataclass(frozen=True)
+class Hindsight:
+    """See the module. `plans` of random strokes make a chunk of lessons, taken `batch` at a time; from the chunk `own` on
+    every other chunk goes its own way. A share `rough` of the plans starts on rough sand, and every so many chunks, one in
+    `other`, is of another blade and another angle of repose."""
+
+    plans: int = 192
+    batch: int = 128
+    rate: float = 1.5e-3
+    decay: int = 150  # chunks after which the learning rate falls as 1 / sqrt(chunk)
+    memory: float = 0.998  # of the moving average
+    own: int = 100
+    rough: float = 0.2
+    other: int = 3
+    every: int = 50
+
+    @property
+    def name(self) -> str:
+        return "hindsight"
+
+    @property
+    def net(self) -> StrokeNet:
+        return StrokeNet()
+
+    def init(self, seed: int) -> Progress:
+        maps = jnp.zeros((1, CELLS, CELLS))
+        params = self.net.init(jax.random.key(seed), maps, maps, jnp.zeros((1, 1, 4)))
+        return Progress(params, params, _optimiser().init(params), jnp.int32(0), jnp.int32(seed))
+
+    def advance(self, state: Progress) -> tuple[Progress, dict[str, float]]:
+        """A chunk of lessons. The metrics are the mean loss, the number of lessons, and whether they are of its own way."""
+        chunk = int(state.chunk)
+        rng = np.random.default_rng([int(state.seed), chunk])
+        scene = other_scene(rng) if chunk % self.other == self.other - 1 else usual_scene()
+        own = chunk >= self.own and chunk % 2 == 1
+        choose = partial(_choose, self.net, state.average, _depth(scene)) if own else None
+        lesson = lessons(scene, rng, self.plans, starts(scene, rng, self.plans, self.rough), choose)
+        order, losses = rng.permutation(len(lesson.goal)), []
+        learned = (state.params, state.average, state.optimiser)
+        for first in range(0, len(order) - self.batch + 1, self.batch):
+            some = _turned(lesson, order[first : first + self.batch], rng, _depth(scene))
+            learned, loss = _learn(self, learned, chunk, int(rng.integers(1 << 31)), *some)
+            losses.append(loss)
+        metrics = {"loss": float(np.mean(losses)), "lessons": float(len(losses) * self.batch), "own": float(own)}
+        return Progress(*learned, state.chunk + 1, state.seed), metrics
+
+    def validate(self, state: Progress) -> dict[str, float]:
+        """What the policy alone makes of goals of random strokes set apart: the share that is `right`, the share of
+        `strokes` that are, and their mean, `score`."""
+        scene, strokes, numbers, goals = _set_apart()
+        plans, maps = one_after_the_other(self.policy(state), scene, np.zeros_like(goals), goals, MOST)
+        rows = [(strokes[k, :n], plans[k, :n], maps[n, k], goals[k]) for k, n in enumerate(numbers)]
+        good = float(np.mean([right(goal, after, _depth(scene)) for _, _, after, goal in rows]))
+        made = sum(strokes_right(a, b) for a, b, _, _ in rows) / float(numbers.sum())
+        return {"score": (good + made) / 2, "right": good, "strokes": made}
+
+    def policy(self, state: Progress) -> Policy:
+        """What acts."""
+        return Policy(self.net, state.average)
+
+
+@cache
+def _set_apart() -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
+    """The scene, the strokes and their numbers, and the goals that they make of level sand."""
+    scene, rng = usual_scene(), np.random.default_rng(_SET_APART)
+    strokes, numbers = random_plans(rng, _TRIALS)
+    return scene, strokes, numbers, way(scene, starts(scene, rng, _TRIALS, 0.0), strokes, numbers)[0]
+
+
+def _depth(scene: Scene) -> float:
+    assert isinstance(scene.tool, Blade)
+    return float(scene.tool.depth)
+
+
+def _optimiser() -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(), optax.add_decayed_weights(1e-4))
+
+
+def _choose(net: StrokeNet, params: Any, depth: float, goal: np.ndarray, current: np.ndarray) -> np.ndarray:
+    out = []
+    for first in range(0, len(goal), 64):
+        part = [np.zeros((64, CELLS, CELLS), np.float32) for _ in range(2)]
+        some = slice(first, first + 64)
+        for to, maps in zip(part, (goal, current), strict=True):
+            to[: len(maps[some])] = maps[some] / depth
+        out.append(np.asarray(_act(net, params, *part))[: len(goal[some])])
+    return np.concatenate(out) * SPACING
+
+
+@partial(jax.jit, static_argnames="net")
+def _act(net: StrokeNet, params: Any, goal: jax.Array, current: jax.Array) -> jax.Array:
+    def due(scores: Scores, strokes: jax.Array) -> jax.Array:
+        odds: Any = net.apply(params, scores, strokes, method="due")
+        return odds
+
+    scores: Any = net.apply(params, goal, current, method="look")
+    return likeliest(due, scores, 1)[0][:, 0]
+
+
+def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: float) -> tuple[np.ndarray, ...]:
+    """Lessons in units of depth and cells, each mirrored and transposed at random."""
+    goal, current = (x[who] / depth for x in (lesson.goal, lesson.current))
+    due = (lesson.due[who] / SPACING).reshape(len(who), -1, 2, 2)
+    for axis in (0, 1):  # x, y
+        flip = rng.random(len(who)) < 0.5
+        goal, current = (np.where(flip[:, None, None], np.flip(x, 2 - axis), x) for x in (goal, current))
+        due[flip, ..., axis] = CELLS - due[flip, ..., axis]
+    swap = rng.random(len(who)) < 0.5
+    goal, current = (np.where(swap[:, None, None], x.swapaxes(1, 2), x) for x in (goal, current))
+    due = np.where(swap[:, None, None, None], due[..., ::-1], due)
+    return goal, current, due, lesson.counts[who]
+
+
+def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
+    """Pairs of ends [B, 6 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved."""
+    batch, count = due.shape[:2]
+    a, b, c, d = jax.random.split(key, 4)
+    every = due.reshape(batch, 2 * count, 2)
+    mixed = jnp.take_along_axis(every, jax.random.randint(a, (batch, 2 * count, 1), 0, 2 * count), 1)
+    other = jnp.take_along_axis(due[:, :, 1], jax.random.randint(b, (batch, count, 1), 0, count), 1)
+    moved = due + jax.random.normal(c, due.shape) * 10 ** jax.random.uniform(d, (batch, count, 2, 1), minval=-1, maxval=0.8)
+    return jnp.concatenate(
+        [
+            due.reshape(batch, count, 4),
+            due[:, :, ::-1].reshape(batch, count, 4),
+            jnp.concatenate([due[:, :, 0], other], -1),
+            mixed.reshape(batch, count, 4),
+            jnp.clip(moved.reshape(batch, count, 4), 0, CELLS),
+        ],
+        1,
+    )
+
+
+def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whether pairs [B, P, 4] are strokes that are due, and whether that is clear."""
+    strokes = due.reshape(*due.shape[:2], 4)
+    off = jnp.max(jnp.abs(pairs[:, :, None] - strokes[:, None]), -1)
+    off = jnp.min(jnp.where(counts[:, None] > 0, off, jnp.inf), -1)
+    return (off <= _SAME).astype(pairs.dtype), ((off <= _SAME) | (off >= _OTHER)).astype(pairs.dtype)
+
+
+@partial(jax.jit, static_argnames="learner")
+def _learn(
+    learner: Hindsight,
+    learned: Any,
+    chunk: int,
+    key: int,
+    goal: jax.Array,
+    current: jax.Array,
+    due: jax.Array,
+    counts: jax.Array,
+) -> tuple[Any, jax.Array]:
+    """A step of gradient descent on a batch: the new parameters, average and optimiser's state, and the loss."""
+    params, average, state = learned
+    pairs = _pairs(jax.random.key(key), due)
+    is_due, matters = _labels(pairs, due, counts)
+
+    def loss(params: Any) -> jax.Array:
+        made: Any = learner.net.apply(params, goal, current, pairs)
+        scores, odds = made
+        share = counts / jnp.sum(counts, 1, keepdims=True)
+        shape = (goal.shape[1], goal.shape[2])
+        start = jnp.einsum("brij,bij->br", spread(due[:, :, 0], shape), scores.start)
+        end = jnp.sum(spread(due[:, :, 1], shape) * ends(scores, due[:, :, 0]), (2, 3))
+        wrong = jnp.sum(matters * optax.sigmoid_binary_cross_entropy(odds, is_due)) / jnp.sum(matters)
+        return -jnp.mean(jnp.sum(share * (start + end), 1)) + _WEIGHT * wrong
+
+    value, gradient = jax.value_and_grad(loss)(params)
+    rate = learner.rate * jnp.minimum(1.0, jnp.sqrt(learner.decay / (chunk + 1.0))) * jnp.minimum(1.0, (chunk + 1) / 8)
+    update, state = _optimiser().update(gradient, state, params)
+    params = jax.tree.map(lambda p, u: p - rate * u, params, update)
+    memory = jnp.minimum(learner.memory, (10.0 * chunk + 1) / (10.0 * chunk + 20))
+    average = jax.tree.map(lambda a, p: memory * a + (1 - memory) * p, average, params)
+    return (params, average, state), value

@@ -1,0 +1,54 @@
+"""Random plans of strokes on the square that glyphs fill; what the learners' goals are made of."""
+
+import numpy as np
+
+from jaxsand.task import GLYPH_SQUARE
+
+MOST = 8
+"""Strokes of a plan, at most."""
+
+_COUNTS = np.array([0.06, 0.16, 0.22, 0.22, 0.14, 0.10, 0.06, 0.04])
+_SHORTEST = 0.15  # of the square
+_TRIES = 16
+
+
+def random_plans(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Strokes [P, MOST, 4] = x0, y0, x1, y1 (m) and how many of them [P] each plan has; the others are repeated ones.
+
+    A stroke starts anywhere, or where an earlier one starts or ends, or on its way, and ends anywhere, or there, or straight
+    across or along.
+    """
+    numbers = 1 + rng.choice(MOST, count, p=_COUNTS / _COUNTS.sum())
+    strokes = np.zeros((count, MOST, 4))
+    for k in range(MOST):
+        strokes[:, k] = _one_more(rng, strokes[:, :k])
+    low, high = GLYPH_SQUARE
+    margin = 0.04 * (high - low)
+    return low - margin + strokes * (high - low + 2 * margin), numbers
+
+
+def _one_more(rng: np.random.Generator, earlier: np.ndarray) -> np.ndarray:
+    """A stroke [P, 4] of the unit square, the longest enough of a few."""
+    count = len(earlier)
+    a, b = _point(rng, earlier, (_TRIES, count)), _point(rng, earlier, (_TRIES, count))
+    straight = rng.random((_TRIES, count)) < 0.35
+    axis = rng.integers(2, size=(_TRIES, count))
+    for i in (0, 1):
+        b[..., i] = np.where(straight & (axis == i), a[..., i], b[..., i])
+    enough = np.hypot(*np.moveaxis(b - a, -1, 0)) >= _SHORTEST
+    first = np.argmax(enough, axis=0)
+    rows = np.arange(count)
+    return np.concatenate([a[first, rows], b[first, rows]], axis=-1)
+
+
+def _point(rng: np.random.Generator, earlier: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Points [T, P, 2]: anywhere, or at an end of an earlier stroke, or on its way."""
+    anywhere = rng.random((*shape, 2))
+    if not earlier.shape[1]:
+        return anywhere
+    which = rng.integers(earlier.shape[1], size=shape)
+    stroke = earlier[np.arange(shape[1]), which]
+    end = rng.random(shape)
+    part = np.where(rng.random(shape) < 0.6, np.round(end), end)[..., None]
+    there = stroke[..., :2] * (1 - part) + stroke[..., 2:] * part
+    return np.where(rng.random(shape)[..., None] < 0.45, there, anywhere)

@@ -1,0 +1,40 @@
+"""The sand that learners practise on: level or rough, the default blade on it or another one."""
+
+import math
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from jaxsand.scene import Scene, make_scene
+from jaxsand.settling import settle_batch
+from jaxsand.tool import Blade
+
+CELLS, SPACING = 32, 0.01
+
+_RELIEF = 0.015  # m, at most
+_FEATURES = (1.0, 6.0)  # cells
+
+
+def usual_scene() -> Scene:
+    """32 x 32 cells of 0.01 m, 29 degrees, the default blade: the scene in which glyphs are judged."""
+    return make_scene((CELLS, CELLS), SPACING, tool=Blade())
+
+
+def other_scene(rng: np.random.Generator) -> Scene:
+    """The same with another blade (0.015 to 0.03 m wide, 5 to 10 mm deep) and angle of repose (25 to 35 degrees)."""
+    blade = Blade(width=rng.uniform(0.015, 0.03), thickness=0.015, depth=rng.uniform(0.005, 0.01))
+    return make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(rng.uniform(25, 35)), tool=blade)
+
+
+def starts(scene: Scene, rng: np.random.Generator, count: int, rough: float) -> np.ndarray:
+    """Maps [P, H, W] (m) at rest: a share of them `rough`, by smoothed noise of a range up to 15 mm; the others level."""
+    maps = np.zeros((count, *scene.grid.shape), np.float32)
+    some = rng.random(count) < rough
+    if not some.any():
+        return maps
+    noise = [
+        gaussian_filter(rng.standard_normal(scene.grid.shape), np.exp(rng.uniform(*np.log(_FEATURES)))) for _ in maps[some]
+    ]
+    surface = np.stack([rng.uniform(0, _RELIEF) * (n - n.mean()) / np.ptp(n) for n in noise]).astype(np.float32)
+    maps[some] = np.asarray(settle_batch(scene, surface).height)
+    return maps
