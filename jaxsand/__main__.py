@@ -49,16 +49,21 @@ def _parser() -> argparse.ArgumentParser:
 def _shape(commands: Any) -> None:
     p = commands.add_parser("shape", help="find the strokes that trench a goal, push them, show what came out")
     p.add_argument("goal", help="a letter, a .txt map of # and ., a .png (dark is dug), a .npy height map in m, or terrain")
-    p.add_argument("--method", choices=["plan", "optimise", "search", "strokes"], default="plan", help=_METHODS)
+    p.add_argument("--method", choices=["plan", "optimise", "policy", "search", "strokes"], default="plan", help=_METHODS)
     p.add_argument(
         "--strokes",
         type=_count,
         metavar="N",
-        help="strokes to use (optimise: as many as pay; search: a glyph's own number, else 6)",
+        help="strokes to use (optimise: as many as pay; search, policy: a glyph's own number, else 6)",
     )
     p.add_argument(
-        "--pushes", type=_count, metavar="N", help="pushes that may be tried (optimise: 4000; search: 1000 a stroke)"
+        "--pushes",
+        type=_count,
+        metavar="N",
+        help="pushes that may be tried (optimise, policy --refine: 4000; search: 1000 a stroke)",
     )
+    p.add_argument("--lookahead", type=_count, metavar="K", help="policy: try its K likeliest strokes on K best plans")
+    p.add_argument("--refine", action="store_true", help="policy: improve its plan by gradients")
     p.add_argument("--seed", type=_seed, metavar="K", help="for the random choices of optimise and search (0)")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
     p.add_argument("--surface", default="level", help="what lies there before: level, terrain or a .npy file (m)")
@@ -134,8 +139,8 @@ def _bench(commands: Any) -> None:
 
 
 _METHODS = (
-    "plan: a shortest path; optimise: strokes by gradients through the sand; search: strokes tried on real sand; "
-    "strokes: a glyph's own"
+    "plan: a shortest path; optimise: strokes by gradients through the sand; policy: what a network learned; "
+    "search: strokes tried on real sand; strokes: a glyph's own"
 )
 
 

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import pairwise
 from typing import Literal
@@ -13,14 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand import goals, task
-from jaxsand.optimise import Optimised, optimise_strokes
+from jaxsand.optimise import Optimised
 from jaxsand.planner import Cell, connected_pieces, plan
 from jaxsand.push import SteppedPush
 from jaxsand.rules import UntilStill
-from jaxsand.sandplan import SandPlan, plan_sand
+from jaxsand.sandplan import SandPlan
 from jaxsand.scene import Scene, make_scene
 from jaxsand.settling import settle, steepest_slope
 from jaxsand.sim import Shaped, act, check, follow_frames
+from jaxsand.stages import Planned
 from jaxsand.tool import Blade
 
 Kind = Literal["map", "glyph", "image", "heights", "terrain"]
@@ -65,7 +66,7 @@ class Target:
     depth: float
     optimal: bool | None = None  # whether the steps are proven fewest, and what is proven of them; plans only
     lower_bound: float | None = None
-    found: SandPlan | Optimised | None = None  # what a search on real sand says of itself
+    found: SandPlan | Optimised | Planned | None = None  # what a search on real sand says of itself
 
     @property
     def footprint(self) -> tuple[float, float]:
@@ -173,26 +174,6 @@ def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> 
     return height_target(goal, "image", name, layout)
 
 
-def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: int, seed: int, tell: Tell) -> Target:
-    """The same goal, by at most so many strokes from a search on real sand, at a cost of about `pushes` (see `plan_sand`).
-
-    Sand counts wherever it lies, also where the goal was drawn without berms.
-    """
-    start = _at_rest(target.scene, before, tell)
-    tell(f"searching {strokes} strokes in about {pushes} pushes")
-    found = plan_sand(target.scene, start, target.goal, strokes=strokes, budget=pushes, seed=seed)
-    return replace(target, method="search", paths=found.paths, optimal=None, lower_bound=None, found=found)
-
-
-def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:
-    """The same goal, by so many strokes (as many as pay if None) from gradients, at a cost of about `pushes`."""
-    start = _at_rest(target.scene, before, tell)
-    tell("sketching")
-    found = optimise_strokes(target.scene, target.goal, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)
-    paths = tuple(stroke.reshape(2, 2) for stroke in found.strokes)
-    return replace(target, method="optimise", paths=paths, optimal=None, lower_bound=None, found=found)
-
-
 def terrain_surface(shape: tuple[int, int], relief: float) -> np.ndarray:
     """The terrain sample at another shape, around height 0, `relief` (m) from its lowest to its highest point."""
     land = task.resample(goals.terrain(), shape)
@@ -207,7 +188,7 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
     """
     scene = target.scene
     began = time.perf_counter()
-    start = _at_rest(scene, before, tell)
+    start = at_rest(scene, before, tell)
     prepared = time.perf_counter()
     tell("compiling")
     longest = max((len(path) for path in target.paths), default=2)
@@ -235,7 +216,8 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda 
     return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), figures, seconds)
 
 
-def _at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
+def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
+    """A surface [H, W] (m; level sand at 0 if None) once it has settled."""
     if before is None:
         return np.zeros(scene.grid.shape, np.float32)
     task.fits(scene, before)

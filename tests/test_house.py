@@ -27,9 +27,11 @@ FLOORS = [
     {"task", "goals", "planner", "plain", "scans", "calibration", "sections", "strokenet"},
     {"strokeloss", "success", "policy"},
     {"sandplan", "optimise", "lookahead"},
+    {"stages"},
     {"shaping", "files", "rut", "strokerivals", "gradcheck"},
     {
         "workprec",
+        "methods",
         "stability",
         "complexity",
         "expansions",

@@ -3,15 +3,14 @@
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxsand import goals, task
-from jaxsand.lookahead import Proposes, look_ahead, one_after_the_other
-from jaxsand.optimise import optimise_strokes
+from jaxsand.lookahead import Proposes
+from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokegoals import StrokeGoal, stroke_goal
 from jaxsand.strokeloss import SandLoss
 from jaxsand.success import right, strict, strokes_right
@@ -20,23 +19,17 @@ from jaxsand.tool import Blade
 Tell = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class Stages:
-    """What follows the policy: a beam of `width` plans tried on the sand (0: none), and `polish` calls for gradients (0)."""
-
-    width: int = 0
-    polish: int = 0
-
-
 def evaluate(
-    policy: Proposes, glyphs: list[StrokeGoal], stages: Stages = Stages(), tell: Tell = lambda _: None
+    policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = lambda _: None
 ) -> dict[str, Any]:
     """As many pushes as each glyph has strokes, judged at the end; see `jaxsand.success`."""
     began = time.perf_counter()
     rows = {}
     for number, glyph in enumerate(glyphs, 1):
         tell(f"{glyph.name}, {number} of {len(glyphs)}")
-        rows[glyph.name] = judged(glyph, plan_for(policy, glyph, stages))
+        sand = SandLoss(glyph.scene, glyph.start, glyph.goal)
+        plan = plan_by_policy(policy, sand, len(glyph.strokes), stages)
+        rows[glyph.name] = judged(glyph, plan.strokes)
     return {
         "right": sum(row["right"] for row in rows.values()),
         "strict": sum(row["strict"] for row in rows.values()),
@@ -45,21 +38,6 @@ def evaluate(
         "glyphs": rows,
         "seconds": time.perf_counter() - began,
     }
-
-
-def plan_for(policy: Proposes, glyph: StrokeGoal, stages: Stages) -> np.ndarray:
-    """The pushes [N, 4] (m) for a glyph, at most as many as it has strokes."""
-    sand = SandLoss(glyph.scene, glyph.start, glyph.goal)
-    count = len(glyph.strokes)
-    if stages.width:
-        plan = look_ahead(policy, sand, count, stages.width).strokes
-    else:
-        plan = one_after_the_other(policy, glyph.scene, glyph.start[None], glyph.goal[None], count)[0][0]
-    if not stages.polish or not len(plan):
-        return plan
-    budget, before = stages.polish, float(sand(plan[None])[0])
-    better = optimise_strokes(glyph.scene, glyph.goal, start=glyph.start, guess=plan, budget=budget, smoothing=None)
-    return better.strokes if better.losses[-1] < before else plan
 
 
 def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:

@@ -15,21 +15,20 @@ if TYPE_CHECKING:
     from jaxsand.optimise import Optimised
     from jaxsand.sandplan import SandPlan
     from jaxsand.shaping import Layout, ShapeResult, Target
+    from jaxsand.stages import Planned
 
 
 def run_shape(options: argparse.Namespace) -> None:
     tell = progress()
     started = time.perf_counter()
     tell("reading the goal")
+    from jaxsand.methods import by_policy, optimised, searched
     from jaxsand.render import save_animation, save_figure, shape_figure
-    from jaxsand.shaping import optimised, searched, shape
+    from jaxsand.shaping import shape
 
     began = time.perf_counter()
-    looks = options.method in ("search", "optimise")
-    if not looks:
-        for option in ("strokes", "pushes", "seed"):
-            if getattr(options, option) is not None:
-                raise ValueError(f"{option}: has an effect with --method search or optimise only; leave it out")
+    looks = options.method in ("search", "optimise", "policy")
+    _check_options(options)
     target = _target(options)
     if looks and target.drawn:
         raise ValueError(
@@ -42,6 +41,12 @@ def run_shape(options: argparse.Namespace) -> None:
         target = searched(target, surface, strokes, options.pushes or 1000 * strokes, options.seed or 0, tell)
     if options.method == "optimise":
         target = optimised(target, surface, options.strokes, options.pushes or 4000, options.seed or 0, tell)
+    if options.method == "policy":
+        from jaxsand.stages import Stages
+
+        strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
+        polish = (options.pushes or 4000) if options.refine else 0
+        target = by_policy(target, surface, strokes, Stages(options.lookahead or 0, polish), tell)
     planned = time.perf_counter() - began
     result = shape(target, surface, tell)
     tell("drawing")
@@ -84,10 +89,30 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
     }
 
 
-def _found(found: "SandPlan | Optimised") -> dict[str, Any]:
+_BY = {
+    "strokes": ("search", "optimise", "policy"),
+    "pushes": ("search", "optimise", "policy"),
+    "seed": ("search", "optimise"),
+    "lookahead": ("policy",),
+    "refine": ("policy",),
+}
+
+
+def _check_options(options: argparse.Namespace) -> None:
+    for option, methods in _BY.items():
+        if getattr(options, option) not in (None, False) and options.method not in methods:
+            raise ValueError(f"{option}: has an effect with --method {' or '.join(methods)} only; leave it out")
+    if options.method == "policy" and options.pushes and not options.refine:
+        raise ValueError("pushes: has an effect on the policy with --refine only; add that, or leave it out")
+
+
+def _found(found: "SandPlan | Optimised | Planned") -> dict[str, Any]:
     """l2 distances in m; `rollouts` counts rough pushes and gradients by what they cost."""
     from jaxsand.optimise import Optimised
+    from jaxsand.stages import Planned
 
+    if isinstance(found, Planned):
+        return {"before": found.before**0.5, "after": found.after**0.5, "rollouts": found.calls}
     if isinstance(found, Optimised):
         far = [float(loss) ** 0.5 for loss in found.losses]
         return {"before": far[0], "after": far[-1], "rollouts": int(found.spent), "found_after": int(found.calls[-1])}
