@@ -1,0 +1,1 @@
+"""Learners that shape sand. Runs from a checkout: `python -m train --help`."""
