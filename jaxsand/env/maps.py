@@ -1,0 +1,96 @@
+"""Goals of the single stroke: binary maps with the cell where the tool starts, row 0 on top."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxsand.planner import Cell, make_problem, plan
+from jaxsand.planner.board import MOVES
+
+STEPS = np.array([*MOVES.values()], np.int32)
+"""Rows and columns that N, E, S and W go on, in that order."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MapPool:
+    """Maps `dig` [G, H, W] (bool) with their `starts` [G, 2] (row, column); an episode takes any of them. See `map_pool`."""
+
+    dig: jax.Array
+    starts: jax.Array
+
+    def draw(self, key: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+        """A map [H, W] and its start [2]."""
+        if self.dig.shape[-2:] != shape:
+            raise ValueError(f"goals.dig: got maps of {list(self.dig.shape[-2:])} cells; the environment has {list(shape)}")
+        i = jax.random.randint(key, (), 0, self.dig.shape[0])
+        return self.dig[i], self.starts[i]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Walks:
+    """The cells of a new random walk of `shortest` to `longest` steps for every episode, which starts where the walk did.
+
+    The walk goes straight on with probability `straight`, else turns left or right, and back only from a dead end.
+
+    A vmapped `step` draws a walk at every step, whether or not an episode ends; `pool_of` draws many beforehand.
+    """
+
+    shortest: jax.Array | int = 6
+    longest: jax.Array | int = 30
+    straight: jax.Array | float = 0.75
+
+    def draw(self, key: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+        """A map [H, W] and its start [2]."""
+        number, begin, walk = jax.random.split(key, 3)
+        steps = jax.random.randint(number, (), self.shortest, jnp.asarray(self.longest) + 1)
+        start = jax.random.randint(begin, (2,), 0, jnp.asarray(shape), jnp.int32)
+        turns = jnp.array([self.straight, (1 - self.straight) / 2, 1e-6, (1 - self.straight) / 2], jnp.float32)
+
+        def one(k: jax.Array, carry: Any) -> Any:
+            dig, place, heading = carry
+            there = place[None] + STEPS
+            on = jnp.all((there >= 0) & (there < jnp.asarray(shape)[None]), axis=1)
+            odds = jnp.where(on, jnp.log(jnp.roll(turns, heading)), -jnp.inf)
+            heading = jax.random.categorical(jax.random.fold_in(walk, k), odds)
+            place = there[heading]
+            return dig.at[place[0], place[1]].set(True), place, heading
+
+        dig = jnp.zeros(shape, bool).at[start[0], start[1]].set(True)
+        heading = jax.random.randint(jax.random.fold_in(begin, 0), (), 0, 4)
+        return lax.fori_loop(0, steps, one, (dig, start, heading))[0], start
+
+
+MapGoals = MapPool | Walks
+
+
+@partial(jax.jit, static_argnames=("count", "shape"))
+def pool_of(goals: MapGoals, key: jax.Array, count: int, shape: tuple[int, int] = (7, 7)) -> MapPool:
+    """So many maps drawn beforehand: a reset that picks one costs next to nothing."""
+    return MapPool(*jax.vmap(lambda k: goals.draw(k, shape))(jax.random.split(key, count)))
+
+
+def map_pool(maps: Sequence[np.ndarray] | np.ndarray, starts: Sequence[Cell | None] | None = None) -> MapPool:
+    """Binary maps [H, W] of one shape (row 0 on top) with their starts (row, column); where there is none, the planner's.
+
+    Raises:
+      ValueError: for maps of different shapes, one that is empty or falls into pieces, or a start that is not to be dug.
+    """
+    maps = [np.asarray(dig, bool) for dig in maps]
+    if not maps or len({dig.shape for dig in maps}) > 1:
+        raise ValueError(f"maps: got shapes {[list(dig.shape) for dig in maps][:4]}; give one or more maps of one shape")
+    starts = [None] * len(maps) if starts is None else starts
+    if len(starts) != len(maps):
+        raise ValueError(f"starts: got {len(starts)} for {len(maps)} maps; give one for each, or none")
+    found = []
+    for dig, start in zip(maps, starts, strict=True):
+        make_problem(dig, start)
+        found.append(plan(dig).cells[0] if start is None else start)
+    return MapPool(jnp.asarray(np.stack(maps)), jnp.asarray(np.array(found, np.int32)))

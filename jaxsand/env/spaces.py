@@ -1,0 +1,71 @@
+"""What an action or an observation may be: boxes, choices, and dictionaries of these."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+@dataclass(frozen=True)
+class Box:
+    """Arrays of a `shape` and `dtype` with every entry from `low` to `high`, which are numbers or infinite."""
+
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: Any = jnp.float32
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Uniform between the bounds; where one is infinite, normal about the other, or about 0."""
+        if jnp.isfinite(self.low) and jnp.isfinite(self.high):
+            return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
+        drawn = jax.random.normal(key, self.shape, self.dtype)
+        if jnp.isfinite(self.low):
+            return self.low + jnp.abs(drawn)
+        return self.high - jnp.abs(drawn) if jnp.isfinite(self.high) else drawn
+
+    def contains(self, x: Any) -> jax.Array:
+        """Whether x has the shape and lies within the bounds."""
+        x = jnp.asarray(x)
+        if x.shape != self.shape:
+            return jnp.zeros((), bool)
+        return jnp.all((x >= self.low) & (x <= self.high))
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """The whole numbers from 0 to n - 1."""
+
+    n: int
+    shape: tuple[int, ...] = field(default=(), init=False)
+    dtype: Any = field(default=jnp.int32, init=False)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        return jax.random.randint(key, (), 0, self.n, self.dtype)
+
+    def contains(self, x: Any) -> jax.Array:
+        x = jnp.asarray(x)
+        if x.shape != () or not jnp.issubdtype(x.dtype, jnp.integer):
+            return jnp.zeros((), bool)
+        return (x >= 0) & (x < self.n)
+
+
+@dataclass(frozen=True)
+class Dict:
+    """A dictionary with a space for each of its keys."""
+
+    spaces: Mapping[str, Any]
+
+    def sample(self, key: jax.Array) -> dict[str, Any]:
+        keys = jax.random.split(key, len(self.spaces))
+        return {name: space.sample(k) for (name, space), k in zip(self.spaces.items(), keys, strict=True)}
+
+    def contains(self, x: Any) -> jax.Array:
+        if set(x) != set(self.spaces):
+            return jnp.zeros((), bool)
+        return jnp.all(jnp.stack([space.contains(x[name]) for name, space in self.spaces.items()]))
+
+
+Space = Box | Discrete | Dict
