@@ -1,0 +1,154 @@
+"""Probe environments: each asks one thing of a learner, and the values of all its states and actions are known.
+
+The idea is Andy Jones's ("Debugging RL without the agonizing pain"); they show what is broken before sand does. What an
+agent learns of a probe that does not hold its value lies in one part: the critic, its discount, or the choice of actions.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsand.env import episode
+from jaxsand.env.episode import Step
+from jaxsand.env.spaces import Box, Discrete
+
+
+@dataclass(frozen=True)
+class Two:
+    """Actions 0 and 1: a reward of 1 for the one whose sign is wanted (0: negative), of -1 for the other."""
+
+    space = Discrete(2)
+
+    def reward(self, action: jax.Array, wanted: jax.Array) -> jax.Array:
+        return (2.0 * action - 1) * wanted
+
+    def best(self, wanted: jax.Array) -> jax.Array:
+        return jnp.int32(wanted > 0)
+
+
+@dataclass(frozen=True)
+class Line:
+    """An action [1] from -1 to 1: a reward of 1 - (action - wanted / 2)^2."""
+
+    space = Box(-1.0, 1.0, (1,))
+
+    def reward(self, action: jax.Array, wanted: jax.Array) -> jax.Array:
+        return 1 - (action[0] - wanted / 2) ** 2
+
+    def best(self, wanted: jax.Array) -> jax.Array:
+        return wanted[None] / 2
+
+
+Actions = Two | Line
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ProbeState:
+    """The `sign` that is shown, -1, 0 or 1, and the `time`."""
+
+    sign: jax.Array
+    time: jax.Array
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Whatever is done, the reward is 1: does the critic learn at all?"""
+
+    steps, shows = 1, False
+
+    def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        return jnp.float32(1)
+
+
+@dataclass(frozen=True)
+class ByObservation:
+    """The reward is the sign that is shown: does the critic look?"""
+
+    steps, shows = 1, True
+
+    def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        return state.sign
+
+
+@dataclass(frozen=True)
+class Late:
+    """The reward is 0, then 1 at the second step: does the value come back through time, with the right discount?"""
+
+    steps, shows = 2, False
+
+    def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        return state.time.astype(jnp.float32)
+
+
+@dataclass(frozen=True)
+class ByAction:
+    """A positive action is wanted: does the policy follow the critic?"""
+
+    steps, shows = 1, False
+
+    def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        return actions.reward(action, jnp.float32(1))
+
+
+@dataclass(frozen=True)
+class ByBoth:
+    """An action of the sign that is shown is wanted: does the policy look?"""
+
+    steps, shows = 1, True
+
+    def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        return actions.reward(action, state.sign)
+
+
+Question = Constant | ByObservation | Late | ByAction | ByBoth
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A question asked with one kind of actions. The observation [2] is the sign that is shown and the time; an episode
+    terminates after the question's steps. It has no parameters: `params` is None."""
+
+    question: Question
+    actions: Actions
+
+    def reset(self, key: jax.Array, params: None) -> tuple[jax.Array, ProbeState]:
+        sign = jax.random.rademacher(key, (), jnp.float32) if self.question.shows else jnp.float32(0)
+        state = ProbeState(sign, jnp.int32(0))
+        return self.observe(state), state
+
+    def step_env(self, key: jax.Array, state: ProbeState, action: Any, params: None) -> Step:
+        reward = self.question.reward(self.actions, state, action)
+        new = ProbeState(state.sign, state.time + 1)
+        return self.observe(new), new, reward, new.time >= self.question.steps, jnp.zeros((), bool), {}
+
+    step = episode.step
+
+    def observe(self, state: ProbeState) -> jax.Array:
+        return jnp.stack([state.sign, state.time.astype(jnp.float32)])
+
+    def action_space(self, params: None) -> Discrete | Box:
+        return self.actions.space
+
+    def observation_space(self, params: None) -> Box:
+        return Box(-1.0, float(self.question.steps), (2,))
+
+    def states(self) -> list[ProbeState]:
+        """Every state in which an action is chosen."""
+        signs = (-1.0, 1.0) if self.question.shows else (0.0,)
+        return [ProbeState(jnp.float32(s), jnp.int32(t)) for s in signs for t in range(self.question.steps)]
+
+    def value(self, state: ProbeState, action: jax.Array, discount: float) -> float:
+        """Q(state, action) = reward + discount x the value of the next state, of the best policy."""
+        now = float(self.question.reward(self.actions, state, action))
+        new = ProbeState(state.sign, state.time + 1)
+        return now if new.time >= self.question.steps else now + discount * self.value(new, self.best(new), discount)
+
+    def best(self, state: ProbeState) -> jax.Array:
+        """The best action; any is where none is better."""
+        return self.actions.best(state.sign if self.question.shows else jnp.float32(1))
+
+
+QUESTIONS: tuple[Question, ...] = (Constant(), ByObservation(), Late(), ByAction(), ByBoth())
