@@ -34,9 +34,10 @@ class StrokeGoal:
         return float(task.iou(self.goal - self.start, after - self.start, depth))
 
 
-def stroke_goal(name: str, strokes: np.ndarray, start: np.ndarray | None = None) -> StrokeGoal:
-    """The goal that strokes (m) leave on a map of 32 x 32 cells of 0.01 m at rest (level if None), by the default blade."""
-    scene = make_scene((_CELLS, _CELLS), _SPACING, tool=Blade())
+def stroke_goal(name: str, strokes: np.ndarray, start: np.ndarray | None = None, scene: Scene | None = None) -> StrokeGoal:
+    """The goal that strokes (m) leave on a map at rest (level if None), of 32 x 32 cells of 0.01 m, by the default blade, or
+    of another scene."""
+    scene = make_scene((_CELLS, _CELLS), _SPACING, tool=Blade()) if scene is None else scene
     start = np.zeros(scene.grid.shape, np.float32) if start is None else np.asarray(start, np.float32)
     shaped = rollout(scene, start, np.asarray(strokes, np.float32))
     check(shaped)

@@ -1,27 +1,27 @@
 """How many glyphs a learner gets right: by itself, by looking ahead with the simulator, and after polish by gradients."""
 
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxsand import goals, task
+from jaxsand import task
 from jaxsand.lookahead import Proposes
 from jaxsand.stages import Stages, plan_by_policy
-from jaxsand.strokegoals import StrokeGoal, stroke_goal
+from jaxsand.strokefigures import found_figure
+from jaxsand.strokegoals import StrokeGoal
 from jaxsand.strokeloss import SandLoss
 from jaxsand.success import right, strict, strokes_right
 from jaxsand.tool import Blade
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Tell = Callable[[str], None]
 
 
-def evaluate(
-    policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = lambda _: None
-) -> dict[str, Any]:
+def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = lambda _: None) -> dict[str, Any]:
     """As many pushes as each glyph has strokes, judged at the end; see `jaxsand.success`."""
     began = time.perf_counter()
     rows = {}
@@ -57,32 +57,13 @@ def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:
     }
 
 
-def read_glyphs(path: Path | None) -> list[StrokeGoal]:
-    """The glyphs of a file, a name to straight strokes [x0, y0, x1, y1] in the unit square, y up; the 26 letters if None.
-
-    Raises:
-      ValueError: names the file, the glyph and what is wrong.
-    """
-    if path is None:
-        table = {letter: goals.letter_strokes(letter).tolist() for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"}
-    else:
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise ValueError(
-                f"glyphs: cannot read {path} ({type(error).__name__}); give a JSON file of names and strokes"
-            ) from None
-    if not isinstance(table, dict) or not table:
-        raise ValueError(f"glyphs: got no glyph in {path}; give a JSON object of names and strokes")
-    return [stroke_goal(name, task.place(_strokes(name, strokes))) for name, strokes in table.items()]
-
-
-def _strokes(name: str, strokes: Any) -> np.ndarray:
-    try:
-        array = np.array(strokes, float)
-        good = array.ndim == 2 and array.shape[1] == 4 and len(array) and np.all((array >= 0) & (array <= 1))
-    except (TypeError, ValueError):
-        good = False
-    if not good:
-        raise ValueError(f"glyphs: {name!r} has no list of strokes [x0, y0, x1, y1] from 0 to 1; y goes up")
-    return array
+def picture(glyphs: list[StrokeGoal], report: dict[str, Any]) -> "Figure":
+    """Goals, and below each what the pushes of a report left, with its IoU; a star where it is right."""
+    shown = []
+    for glyph in glyphs:
+        row = report["glyphs"][glyph.name]
+        pushes = np.array(row["pushes"], float).reshape(-1, 4)
+        after = SandLoss(glyph.scene, glyph.start, glyph.goal).maps(pushes[None])[0]
+        name = f"{glyph.name}*" if row["right"] else glyph.name
+        shown.append((name, row["iou"], glyph.goal - glyph.start, after - glyph.start))
+    return found_figure(shown)

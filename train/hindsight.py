@@ -56,12 +56,14 @@ class Hindsight:
     plans: int = 192
     batch: int = 128
     rate: float = 1.5e-3
-    decay: int = 150  # chunks after which the learning rate falls as 1 / sqrt(chunk)
-    memory: float = 0.998  # of the moving average
-    own: int = 100
+    decay: int = 30  # chunks after which the learning rate falls as 1 / sqrt(chunk)
+    memory: float = 0.996  # of the moving average
+    own: int = 20
     rough: float = 0.2
     other: int = 3
-    every: int = 50
+    every: int = 12
+    widths: tuple[int, int, int] = (32, 64, 96)
+    blocks: tuple[int, int, int] = (1, 2, 2)
 
     @property
     def name(self) -> str:
@@ -69,7 +71,7 @@ class Hindsight:
 
     @property
     def net(self) -> StrokeNet:
-        return StrokeNet()
+        return StrokeNet(self.widths, self.blocks)
 
     def init(self, seed: int) -> Progress:
         maps = jnp.zeros((1, CELLS, CELLS))
@@ -77,7 +79,7 @@ class Hindsight:
         return Progress(params, params, _optimiser().init(params), jnp.int32(0), jnp.int32(seed))
 
     def advance(self, state: Progress) -> tuple[Progress, dict[str, float]]:
-        """A chunk of lessons. The metrics are the mean loss, the number of lessons, and whether they are of its own way."""
+        """A chunk of lessons. The metrics are the mean loss, how many lessons and pushes, and whether of its own way."""
         chunk = int(state.chunk)
         rng = np.random.default_rng([int(state.seed), chunk])
         scene = other_scene(rng) if chunk % self.other == self.other - 1 else usual_scene()
@@ -90,8 +92,8 @@ class Hindsight:
             some = _turned(lesson, order[first : first + self.batch], rng, _depth(scene))
             learned, loss = _learn(self, learned, chunk, int(rng.integers(1 << 31)), *some)
             losses.append(loss)
-        metrics = {"loss": float(np.mean(losses)), "lessons": float(len(losses) * self.batch), "own": float(own)}
-        return Progress(*learned, state.chunk + 1, state.seed), metrics
+        figures = {"loss": np.mean(losses), "lessons": len(losses) * self.batch, "pushes": lesson.pushes, "own": own}
+        return Progress(*learned, state.chunk + 1, state.seed), {name: float(x) for name, x in figures.items()}
 
     def validate(self, state: Progress) -> dict[str, float]:
         """What the policy alone makes of goals of random strokes set apart: the share that is `right`, the share of

@@ -18,12 +18,14 @@ _ASTRAY = 0.05  # a stroke farther (m) than this from each that is due was none 
 
 @dataclass(frozen=True)
 class Lessons:
-    """`goal` and `current` maps [S, H, W] (m), and the strokes `due` [S, MOST, 4] (m), of which those `counts` [S, MOST]."""
+    """`goal` and `current` maps [S, H, W] (m), and the strokes `due` [S, MOST, 4] (m), of which those `counts` [S, MOST];
+    and how many `pushes` of the simulator they took."""
 
     goal: np.ndarray
     current: np.ndarray
     due: np.ndarray
     counts: np.ndarray
+    pushes: int
 
 
 def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarray, choose: Choose | None = None) -> Lessons:
@@ -49,7 +51,8 @@ def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarra
             here = every[(numbers > k) & np.isfinite(maps[k]).all((1, 2)) & np.isfinite(goal).all((1, 2))]
             due = np.take_along_axis(strokes[here], turns[here][:, [*range(k, MOST), *range(k)], None], 1)
             out.append((goal[here], maps[k][here], due, np.arange(MOST) < numbers[here, None] - k))
-    return Lessons(*(np.concatenate(parts).astype(np.float32) for parts in zip(*out, strict=True)))
+    goals, maps, due, counts = (np.concatenate(parts) for parts in zip(*out, strict=True))
+    return Lessons(goals, maps, due.astype(np.float32), counts, 2 * int(numbers.sum()))
 
 
 def way(scene: Scene, start: np.ndarray, strokes: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

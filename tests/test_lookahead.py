@@ -1,0 +1,73 @@
+"""Looking ahead: with policies of known worth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from jaxsand.lookahead import look_ahead, one_after_the_other
+from jaxsand.stages import Stages, plan_by_policy
+from jaxsand.strokegoals import letters
+from jaxsand.strokeloss import SandLoss
+
+F = letters("F")[0]  # three strokes
+SAND = SandLoss(F.scene, F.start, F.goal)
+
+
+@dataclass(frozen=True)
+class Always:
+    """Proposes the same strokes, whatever it sees, in this order."""
+
+    strokes: np.ndarray
+
+    def propose(self, scene, goal, current, count):
+        some = self.strokes[:count]
+        return np.repeat(some[None], len(goal), 0), np.zeros((len(goal), len(some)))
+
+
+def test_the_policy_alone_makes_its_first_stroke_again_and_again():
+    plans, maps = one_after_the_other(Always(F.strokes), F.scene, F.start[None], F.goal[None], 2)
+    assert plans.shape == (1, 2, 4)
+    np.testing.assert_array_equal(plans[0, 0], plans[0, 1])
+    assert maps.shape == (3, 1, *F.scene.grid.shape)
+    np.testing.assert_allclose(maps[2, 0], SAND.maps(plans)[0], atol=1e-7)
+
+
+def test_many_goals_at_once_are_what_each_is_alone():
+    goals = np.stack([F.goal, F.goal * 0])
+    start = np.zeros_like(goals)
+    _, both = one_after_the_other(Always(F.strokes), F.scene, start, goals, 1)
+    _, one = one_after_the_other(Always(F.strokes), F.scene, start[:1], goals[:1], 1)
+    np.testing.assert_allclose(both[1, 0], one[1, 0], atol=1e-7)
+
+
+def test_looking_ahead_finds_the_order_and_leaves_out_what_misleads():
+    wrong = np.array([[0.05, 0.05, 0.25, 0.06]])
+    found = look_ahead(Always(np.concatenate([wrong, F.strokes[::-1]])), SAND, 3, width=4)
+    assert len(found.strokes) == 3
+    assert found.losses[0] == SAND.loss_of(F.start)
+    assert np.all(np.diff(found.losses) < 0)
+    np.testing.assert_allclose(found.losses[-1], SAND(found.strokes[None])[0], rtol=1e-3, atol=1e-9)
+    assert found.losses[-1] < 0.1 * found.losses[0]
+    assert found.calls <= 3 * 4**2
+
+
+def test_nothing_is_done_where_nothing_helps():
+    done = SandLoss(F.scene, F.goal, F.goal)
+    found = look_ahead(Always(F.strokes), done, 3, width=2)
+    assert found.strokes.shape == (0, 4)
+    assert found.losses.tolist() == [0.0]
+    planned = plan_by_policy(Always(F.strokes), done, 3, Stages(width=2, polish=100))
+    assert len(planned.strokes) == 0
+    assert planned.after == planned.before == 0
+
+
+@pytest.mark.slow
+def test_gradients_bring_a_plan_closer_or_leave_it():
+    crooked = F.strokes + 0.004
+    alone = plan_by_policy(Always(crooked), SAND, 3, Stages(width=3))
+    polished = plan_by_policy(Always(crooked), SAND, 3, Stages(width=3, polish=600))
+    assert alone.after < alone.before
+    assert polished.after < 0.5 * alone.after
+    np.testing.assert_allclose(polished.after, SAND(polished.strokes[None])[0], rtol=1e-3)
+    assert polished.calls <= alone.calls + 600

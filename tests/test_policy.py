@@ -1,0 +1,126 @@
+"""The policy's network, how strokes are read off it, and its file."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsand.policy import Policy, load_policy, save_policy
+from jaxsand.scene import make_scene
+from jaxsand.strokenet import Scores, StrokeNet, ends, likeliest, seen_along, spread, symmetric
+from jaxsand.tool import Blade
+
+NET = StrokeNet((8, 8, 8), (1, 1, 1))
+SIDE = 32
+
+
+def maps(seed, count=2):
+    return jnp.asarray(np.random.default_rng(seed).standard_normal((count, SIDE, SIDE)), jnp.float32)
+
+
+@pytest.fixture(scope="module")
+def params():
+    variables = NET.init(jax.random.key(0), maps(0), maps(1), jnp.zeros((2, 1, 4), jnp.float32))
+    return jax.tree.map(lambda p: p + 0.1 * jnp.sin(jnp.arange(p.size, dtype=p.dtype)).reshape(p.shape), variables)
+
+
+def test_starts_and_ends_are_shares_of_one(params):
+    scores = NET.apply(params, maps(0), maps(1), method="look")
+    np.testing.assert_allclose(jnp.exp(scores.start).sum((1, 2)), 1, rtol=1e-5)
+    points = jnp.array([[[3.2, 4.9]], [[31.9, 0.0]]], jnp.float32)
+    np.testing.assert_allclose(jnp.exp(ends(scores, points)).sum((2, 3)), 1, rtol=1e-5)
+
+
+def test_points_are_spread_over_the_cells_around_them():
+    share = spread(jnp.array([2.75, 1.5]), (4, 5))
+    np.testing.assert_allclose(share.sum(), 1)
+    np.testing.assert_allclose(share[1, 2], 0.75)
+    np.testing.assert_allclose(share[1, 3], 0.25)
+
+
+def test_lines_see_what_lies_on_them():
+    y, x = jnp.meshgrid(jnp.arange(SIDE) + 0.5, jnp.arange(SIDE) + 0.5, indexing="ij")
+    sight = jnp.stack([x, y], -1)[None, None]
+    seen = seen_along(sight, jnp.array([[[4.0, 8.0, 20.0, 24.0]]]))[0, 0, 0]
+    np.testing.assert_allclose(seen[1], [4, 8], atol=1e-5)
+    np.testing.assert_allclose(seen[-2], [20, 24], atol=1e-5)
+    np.testing.assert_allclose(seen[0], [4 - 1.5 / np.sqrt(2), 8 - 1.5 / np.sqrt(2)], atol=1e-5)
+    np.testing.assert_allclose(np.diff(seen[1:-1, 0]), 16 / 11, atol=1e-5)
+
+
+def test_what_is_symmetric_turns_with_its_maps(params):
+    goal, current = maps(0), maps(1)
+    strokes = jnp.array([[[4.0, 8.0, 20.0, 24.0], [9.0, 3.0, 11.0, 30.0]]] * 2, jnp.float32)
+    one = symmetric(NET, params, goal, current)
+    odds = NET.apply(params, one, strokes, method="due")
+    for flip in (False, True):
+        turn = (lambda x: jnp.flip(x, 2)) if flip else (lambda x: x.swapaxes(1, 2))
+        moved = strokes.at[..., ::2].set(SIDE - strokes[..., ::2]) if flip else strokes[..., jnp.array([1, 0, 3, 2])]
+        other = symmetric(NET, params, turn(goal), turn(current))
+        np.testing.assert_allclose(other.start, turn(one.start), atol=1e-4)
+        np.testing.assert_allclose(NET.apply(params, other, moved, method="due"), odds, atol=1e-4)
+
+
+def test_the_likeliest_strokes_are_read_between_the_peaks():
+    wanted = np.array([[5.5, 6.5, 20.5, 6.5], [8.5, 25.5, 8.5, 12.5]])
+    start, query, key = np.full((SIDE, SIDE), -20.0), np.zeros((SIDE, SIDE, 2)), np.zeros((SIDE, SIDE, 2))
+    for k, (x0, y0, x1, y1) in enumerate(wanted - 0.5):
+        start[int(y0), int(x0)] = -k
+        query[int(y0), int(x0), k] = 20
+        key[int(y1), int(x1), k] = 1
+    scores = Scores(*(jnp.asarray(x, jnp.float32)[None] for x in (start, query, key, np.zeros((1, SIDE, SIDE, 1)))))
+    strokes, score = likeliest(lambda _, strokes: jnp.zeros(strokes.shape[:2], strokes.dtype), scores, 2)
+    np.testing.assert_allclose(strokes[0], wanted, atol=0.1)
+    assert score[0, 0] > score[0, 1]
+
+    def second_only(_, strokes):
+        return jnp.where(jnp.abs(strokes[..., 0] - 8.5) < 1, 20.0, -20.0).astype(strokes.dtype)
+
+    np.testing.assert_allclose(likeliest(second_only, scores, 1)[0][0, 0], wanted[1], atol=0.1)
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (20, 32), (40, 70), (1, 5)])
+def test_proposals_lie_on_maps_of_any_shape(params, shape):
+    scene = make_scene(shape, 0.01, tool=Blade())
+    rng = np.random.default_rng(0)
+    goal, current = (1e-3 * rng.standard_normal((3, *shape)) for _ in range(2))
+    strokes, scores = Policy(NET, params).propose(scene, goal, current, 4)
+    assert strokes.shape == (3, 4, 4)
+    assert np.all(np.diff(scores, axis=1) <= 0)
+    assert np.all(strokes > 0)
+    assert np.all(strokes < 0.01 * np.array([*shape[::-1]] * 2))
+    alone, _ = Policy(NET, params).propose(scene, goal[1:2], current[1:2], 4)
+    np.testing.assert_allclose(alone[0], strokes[1], atol=1e-4)
+
+
+def test_proposals_go_with_the_depth_of_the_blade(params):
+    rng = np.random.default_rng(0)
+    goal = 1e-3 * rng.standard_normal((1, SIDE, SIDE))
+    shallow, deep = (make_scene((SIDE, SIDE), 0.01, tool=Blade(depth=d)) for d in (0.004, 0.008))
+    one = Policy(NET, params).propose(shallow, goal, 0 * goal, 2)[0]
+    np.testing.assert_allclose(Policy(NET, params).propose(deep, 2 * goal, 0 * goal, 2)[0], one, atol=1e-5)
+
+
+def test_a_scene_that_is_not_dug_is_refused(params):
+    policy, goal = Policy(NET, params), np.zeros((1, SIDE, SIDE))
+    with pytest.raises(ValueError, match=r"scene\.tool: got NoTool; give make_scene"):
+        policy.propose(make_scene((SIDE, SIDE)), goal, goal)
+    with pytest.raises(ValueError, match=r"scene\.tool\.depth: got"):
+        policy.propose(make_scene((SIDE, SIDE), tool=Blade(depth=-0.001)), goal, goal)
+
+
+def test_a_policy_comes_back_from_its_file_in_half_precision(params, tmp_path):
+    save_policy(Policy(NET, params), tmp_path / "policy.npz", seed=3)
+    again = load_policy(tmp_path / "policy.npz")
+    assert again.net == NET
+    for a, b in zip(jax.tree.leaves(params), jax.tree.leaves(again.params), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("content", [b"", b"no policy", None])
+def test_a_file_that_is_no_policy_is_refused(content, tmp_path):
+    path = tmp_path / "policy.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"policy: cannot read .*policy\.npz"):
+        load_policy(path)

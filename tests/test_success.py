@@ -1,0 +1,49 @@
+"""When a glyph counts as right: known answers, and what the rule is to tell apart."""
+
+import numpy as np
+
+from jaxsand.strokegoals import letters
+from jaxsand.strokeloss import SandLoss
+from jaxsand.success import right, strict, strokes_right
+from jaxsand.tool import Blade
+
+DEPTH = float(Blade().depth)
+E = letters("E")[0]  # four strokes
+
+
+def left(strokes):
+    return SandLoss(E.scene, E.start, E.goal).maps(np.asarray(strokes, np.float32)[None])[0]
+
+
+def test_the_goal_itself_is_right_and_strict_and_level_sand_is_not():
+    assert right(E.goal, E.goal, DEPTH)
+    assert strict(E.goal, E.start, E.goal, DEPTH)
+    assert not right(E.goal, E.start, DEPTH)
+    assert not strict(E.goal, E.start, E.start, DEPTH)
+    assert right(E.start, E.start, DEPTH)  # nothing was asked for, and nothing was dug
+
+
+def test_one_stroke_less_or_another_one_is_wrong_and_a_small_shift_is_right_but_not_strict():
+    assert not right(E.goal, left(E.strokes[:-1]), DEPTH)
+    assert not right(E.goal, left([*E.strokes[:-1], [0.06, 0.06, 0.26, 0.26]]), DEPTH)
+    shifted = left(E.strokes + np.array([0.005, 0, 0.005, 0]))
+    assert right(E.goal, shifted, DEPTH)
+    assert not strict(E.goal, E.start, shifted, DEPTH)
+
+
+def test_cells_count_within_one_cell_by_eight_neighbours():
+    goal, off = np.zeros((9, 9)), np.zeros((9, 9))
+    goal[4, 2:7] = -DEPTH
+    off[5, 3:8] = -DEPTH  # one cell to the side and one on
+    assert right(goal, off, DEPTH)
+    off = np.roll(off, 1, 0)
+    assert not right(goal, off, DEPTH)
+
+
+def test_strokes_count_in_either_direction_each_push_once():
+    strokes = np.array([[0.1, 0.1, 0.2, 0.1], [0.1, 0.1, 0.2, 0.1], [0.1, 0.2, 0.2, 0.2]])
+    pushes = np.array([[0.2, 0.1, 0.1, 0.1], [0.1, 0.2, 0.2, 0.2299]])
+    assert strokes_right(strokes, pushes) == 2  # one of the two like ones has no push left; 3 cm are 12% of 25 cm
+    assert strokes_right(strokes[2:], pushes + 0.001) == 0
+    assert strokes_right(strokes, np.zeros((0, 4))) == 0
+    assert strokes_right(strokes, strokes[::-1, [2, 3, 0, 1]]) == 3
