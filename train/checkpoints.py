@@ -1,0 +1,161 @@
+"""What a run leaves in its folder, so that it can be read back: states as files of plain arrays, learners as JSON.
+
+A checkpoint is one file: a single rename puts it in place whole, which a folder's checkpoint (Orbax) cannot promise, and it
+needs no import. It is written beside, brought to the disk, then renamed, so that a kill leaves the one before.
+"""
+
+import importlib
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+State = Any
+"""A pytree of arrays (typed keys too): parameters, optimiser, buffer, environments, key, counters; everything."""
+
+_ABOUT, _STATE = "about", "state/"
+_OURS = ("train", "jaxsand")
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error)
+
+
+@dataclass(frozen=True)
+class At:
+    """Where a run is: after `chunk` chunks and `seconds` of work, with the best `score` so far, and so many bytes of metrics
+    in `rows`."""
+
+    chunk: int = 0
+    seconds: float = 0.0
+    score: float = -np.inf
+    rows: int = 0
+
+
+def save(path: Path, state: State, at: At) -> None:
+    """Puts a checkpoint in place of the one before, whole or not at all.
+
+    Raises:
+      ValueError: if it cannot be written; the one before stays.
+    """
+    arrays: dict[str, Any] = {name: np.asarray(_plain(leaf)) for name, leaf in _named(state).items()}
+    arrays[_ABOUT] = np.array(json.dumps(asdict(at)))
+    beside = path.with_name(path.name + ".part")
+    try:
+        with beside.open("wb") as file:
+            np.savez(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError as error:
+        raise unwritable(path, error) from None
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def load(path: Path, like: State) -> tuple[State, At]:
+    """The state in a file, of the kind of `like`, and where the run was.
+
+    Raises:
+      ValueError: if it cannot be read, or holds something else.
+    """
+    leaves = _named(like)
+    with _opened(path) as data:
+        at = At(**json.loads(str(data[_ABOUT])))
+        arrays = {name: data[name] for name in data.files if name != _ABOUT}
+    for name in leaves.keys() | arrays.keys():
+        have, want = (_kind(arrays.get(name)), _kind(_plain(leaves.get(name))))
+        if have != want:
+            raise ValueError(
+                f"run: {path} holds {have} as {name.removeprefix(_STATE)}, this learner {want}; use its own learner"
+            )
+    filled = [_like(leaf, arrays[name]) for name, leaf in leaves.items()]
+    return jax.tree.unflatten(jax.tree.structure(like), filled), at
+
+
+def where(path: Path) -> At:
+    """Where the run was when it wrote this file; see `load`."""
+    with _opened(path) as data:
+        return At(**json.loads(str(data[_ABOUT])))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with path.open("rb") as file, np.load(file) as data:
+            yield data
+    except FileNotFoundError:
+        raise ValueError(f"run: there is no {path}; train first, or check the name") from None
+    except _UNREADABLE as error:
+        other = "best.npz" if path.name == "last.npz" else "last.npz"
+        raise ValueError(
+            f"run: cannot read {path} ({type(error).__name__}); put a copy of {other} in its place, or train anew"
+        ) from None
+
+
+def unwritable(path: Path, error: OSError) -> ValueError:
+    """What to say when a file of a run cannot be written."""
+    return ValueError(
+        f"out: cannot write {path} ({error.strerror}); make room or choose another folder: what is there stays good"
+    )
+
+
+def described(thing: Any) -> Any:
+    """A learner, or a part of it, as JSON: frozen dataclasses of numbers, texts, tuples and other such dataclasses."""
+    if is_dataclass(thing):
+        own = {f.name: described(getattr(thing, f.name)) for f in fields(thing) if f.init}
+        return {"is": f"{type(thing).__module__}:{type(thing).__qualname__}"} | own
+    if isinstance(thing, tuple):
+        return [described(x) for x in thing]
+    if thing is None or isinstance(thing, bool | int | float | str):
+        return thing
+    raise ValueError(f"learner: got {thing!r} in its fields; give numbers, texts, tuples and dataclasses of them")
+
+
+def restored(data: Any) -> Any:
+    """What `described` described.
+
+    Raises:
+      ValueError: if it names what is no dataclass of `train` or `jaxsand`, or has other fields.
+    """
+    if isinstance(data, list):
+        return tuple(restored(x) for x in data)
+    if not isinstance(data, dict):
+        return data
+    module, _, name = str(data.get("is")).partition(":")
+    if module.partition(".")[0] not in _OURS:
+        raise ValueError(f"config: got {data.get('is')!r}, which is no part of {' or '.join(_OURS)}; use a run's own file")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+        return kind(**{field: restored(x) for field, x in data.items() if field != "is"})
+    except (ImportError, AttributeError, TypeError) as error:
+        raise ValueError(f"config: cannot make {data['is']} ({error}); use the version that the run was made with") from None
+
+
+def _named(state: State) -> dict[str, Any]:
+    paths = jax.tree_util.tree_flatten_with_path(state)[0]
+    return {_STATE + jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in paths}
+
+
+def _is_key(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _plain(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _like(leaf: Any, array: np.ndarray) -> Any:
+    if _is_key(leaf):
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(leaf))
+    return jnp.asarray(array) if isinstance(leaf, jax.Array) else array
+
+
+def _kind(array: Any) -> str:
+    return "nothing" if array is None else f"{np.dtype(array.dtype).name}{list(array.shape)}"
