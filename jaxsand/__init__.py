@@ -54,6 +54,7 @@ _HOMES = {
     "check": "sim",
     "follow": "sim",
     "follow_frames": "sim",
+    "make": "env",
     "make_scene": "scene",
     "optimise_strokes": "optimise",
     "plan": "planner",

@@ -29,6 +29,7 @@ FLOORS = [
     {"sandplan", "optimise", "lookahead"},
     {"stages"},
     {"shaping", "files", "rut", "strokerivals", "gradcheck"},
+    {"env"},
     {
         "workprec",
         "methods",
@@ -58,6 +59,7 @@ INSIDE = {
     ],
     "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],
     "optimise": [{"account", "sketch"}, {"moves"}],
+    "env": [{"spaces", "episode", "maps", "pushing"}, {"onmap", "multi"}, {"onsand", "library"}],
     "commands": [{"printing"}, {"shape", "settle", "plan", "trench", "bench"}],
 }
 HEAVY = {"matplotlib": {"render", "rutfigures", "strokefigures", "goals"}, "PIL": {"render", "goals"}}

@@ -3,17 +3,125 @@
 The state of an episode is apart from the parameters, whose leaves may be vmapped; see `episode.Environment`.
 """
 
+from dataclasses import fields
 from typing import Any
 
+from jaxsand.env.library import Level, RandomStrokes, Rough, library
 from jaxsand.env.maps import MapPool, Walks, map_pool, pool_of
+from jaxsand.env.multi import (
+    LevelGoals,
+    MultiStroke,
+    NoStop,
+    OnlyDug,
+    RoughGoals,
+    Stop,
+    StrokeParams,
+    StrokeState,
+    WithBerms,
+)
 from jaxsand.env.onmap import MapParams, MapState, OnMap
+from jaxsand.env.onsand import OnSand, SandParams, SandState
+from jaxsand.env.pushing import ByLength, Together
 from jaxsand.env.spaces import Box, Dict, Discrete
+from jaxsand.push import SteppedPush
+from jaxsand.scene import Scene, make_scene
+from jaxsand.tool import Blade
+from jaxsand.window import Whole, Window
 
-__all__ = ["Box", "Dict", "Discrete", "MapParams", "MapPool", "MapState", "OnMap", "Walks", "make", "map_pool", "pool_of"]
+__all__ = [
+    "Box",
+    "ByLength",
+    "Dict",
+    "Discrete",
+    "Level",
+    "LevelGoals",
+    "MapParams",
+    "MapPool",
+    "MapState",
+    "MultiStroke",
+    "NoStop",
+    "OnMap",
+    "OnSand",
+    "OnlyDug",
+    "RandomStrokes",
+    "Rough",
+    "RoughGoals",
+    "SandParams",
+    "SandState",
+    "Stop",
+    "StrokeParams",
+    "StrokeState",
+    "Together",
+    "Walks",
+    "WithBerms",
+    "library",
+    "make",
+    "map_pool",
+    "pool_of",
+]
+
+_SHAPE, _SPACING, _WINDOW = (32, 32), 0.01, (16, 16)
 
 
-def make(name: str, **options: Any) -> tuple[OnMap, MapParams]:
-    """An environment and its parameters."""
-    if name != "single-stroke":
-        raise ValueError(f"name: got {name!r}; give single-stroke")
-    return OnMap(options.pop("shape", (7, 7))), MapParams(**options)
+def make(name: str, **options: Any) -> tuple[Any, Any]:
+    """An environment and its parameters, after the protocol of gymnax 1.x.
+
+        obs, state = env.reset(key, params)
+        obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+
+    `step` begins a new episode where one ended: the observation is then the new one's, and info["final_observation"] the
+    last of the old one; `step_env` does not. All of it works on one environment: use jax.vmap, over params too.
+
+    "single-stroke": `on` an `OnMap()` (a binary map, the default) or an `OnSand()` (the simulator). "multi-stroke": the
+    fields of `MultiStroke`, where goals come from (`goals`: `RandomStrokes()`, glyphs {name: strokes}, or maps [G, H, W] in
+    m), where they start (`starts`: `Level()` or `Rough(relief)`), and a `seed` for both. Every field of the params may be
+    given.
+
+    Raises:
+      ValueError: for a name or an option that there is not.
+    """
+    match name:
+        case "single-stroke":
+            return _single(**options)
+        case "multi-stroke":
+            return _multi(**options)
+    raise ValueError(f"name: got {name!r}; give single-stroke or multi-stroke")
+
+
+def _single(on: OnMap | OnSand | None = None, scene: Scene | None = None, **params: Any) -> tuple[Any, Any]:
+    env = OnMap() if on is None else on
+    _known("single-stroke", params, fields(MapParams))
+    if isinstance(env, OnMap):
+        if scene is not None:
+            raise ValueError("scene: has no effect on a binary map; leave it out, or give on=OnSand()")
+        return env, MapParams(**params)
+    layout = env.layout
+    rows, columns = (n * layout.cell + 2 * layout.margin for n in env.shape)
+    scene = make_scene((rows, columns), layout.spacing, tool=layout.blade) if scene is None else scene
+    if scene.grid.shape != (rows, columns):
+        raise ValueError(
+            f"scene: got {list(scene.grid.shape)} cells, the layout takes [{rows}, {columns}]; make it as large"
+        )
+    return env, SandParams(scene, **params)
+
+
+def _multi(
+    goals: Any = None, starts: Level | Rough | None = None, scene: Scene | None = None, seed: int = 0, **options: Any
+) -> tuple[Any, Any]:
+    own = {f.name for f in fields(MultiStroke)}
+    env = MultiStroke(**{key: value for key, value in options.items() if key in own})
+    params = {key: value for key, value in options.items() if key not in own}
+    _known("multi-stroke", params, (f for f in fields(StrokeParams) if f.name == "limit"))
+    if scene is None:
+        window = Window(_WINDOW) if isinstance(env.push, SteppedPush) else Whole()
+        scene = make_scene(_SHAPE, _SPACING, tool=Blade(), window=window)
+    if not isinstance(goals, LevelGoals | RoughGoals):
+        goals = library(env, scene, RandomStrokes() if goals is None else goals, Level() if starts is None else starts, seed)
+    return env, StrokeParams(scene, goals, **params)
+
+
+def _known(name: str, options: dict[str, Any], some: Any) -> None:
+    names = [f.name for f in some]
+    for option in options:
+        if option not in names:
+            raise ValueError(f"{option}: no option of {name}; give some of {', '.join(names)}, or see help(jaxsand.make)")

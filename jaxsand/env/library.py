@@ -1,0 +1,115 @@
+"""Pools of goals for many strokes, made once: random strokes, glyphs, or height maps, on level or on rough sand."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from jaxsand import task
+from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
+from jaxsand.rules import UntilStill
+from jaxsand.scene import Scene
+from jaxsand.settling import settle_batch
+from jaxsand.sim import check
+
+_TRIES = 16
+
+
+@dataclass(frozen=True)
+class RandomStrokes:
+    """So many goals of `fewest` to `most` random strokes in the glyphs' square, none shorter than a part of its side."""
+
+    goals: int = 256
+    fewest: int = 1
+    most: int = 6
+    shortest: float = 0.15
+
+    def plans(self, rng: np.random.Generator) -> list[np.ndarray]:
+        """Strokes [n, 4] of the unit square for each goal."""
+        if not (self.goals >= 1 and 1 <= self.fewest <= self.most and 0 <= self.shortest < 1):
+            raise ValueError(f"goals: got {self}; give one goal or more, 1 <= fewest <= most, and shortest from 0 to 1")
+        drawn = rng.random((_TRIES, self.goals, self.most, 4))
+        long = np.hypot(*np.moveaxis(drawn[..., 2:] - drawn[..., :2], -1, 0)) >= self.shortest
+        first = np.argmax(long, axis=0)[None, ..., None]
+        strokes = np.take_along_axis(drawn, first, 0)[0]
+        numbers = rng.integers(self.fewest, self.most + 1, self.goals)
+        return [some[:n] for some, n in zip(strokes, numbers, strict=True)]
+
+
+@dataclass(frozen=True)
+class Level:
+    """Sand level at height 0 (neutral)."""
+
+
+@dataclass(frozen=True)
+class Rough:
+    """Random surfaces of a height range of `relief` (m) before they come to rest, smooth over `scale` cells."""
+
+    relief: float = 0.01
+    scale: float = 3.0
+
+
+Goals = RandomStrokes | Mapping[str, Any] | np.ndarray
+"""Random strokes, or names with strokes [n, 4] of the unit square as a glyph file has them, or maps [G, H, W] (m)."""
+
+
+def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough, seed: int) -> LevelGoals | RoughGoals:
+    """The pool that an environment draws its goals from; strokes are pushed as the environment pushes.
+
+    Raises:
+      ValueError: for goals that are none, or are not of the scene's shape.
+    """
+    rng = np.random.default_rng(seed)
+    if isinstance(goals, np.ndarray):
+        if goals.ndim != 3 or not len(goals):
+            raise ValueError(f"goals: got shape {list(goals.shape)}; give one or more maps [G, H, W] in metres")
+        task.fits(scene, goals[0], "goals")
+        task.finite(goals, "goals")
+        plans, count = [], len(goals)
+    else:
+        plans = goals.plans(rng) if isinstance(goals, RandomStrokes) else [np.asarray(s, float) for s in goals.values()]
+        if not plans or any(some.ndim != 2 or some.shape[1] != 4 or not len(some) for some in plans):
+            raise ValueError("goals: got a glyph without strokes; give names with strokes [[x0, y0, x1, y1], ...]")
+        count = len(plans)
+    before = _surfaces(scene, starts, count, rng)
+    after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans)
+    if isinstance(starts, Level):
+        return LevelGoals(jnp.asarray(after))
+    return RoughGoals(jnp.asarray(after), jnp.asarray(before))
+
+
+def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Maps [count, H, W] (m) at rest."""
+    shape = (count, *scene.grid.shape)
+    if isinstance(starts, Level):
+        return np.zeros(shape, np.float32)
+    if not (starts.relief >= 0 and starts.scale > 0):
+        raise ValueError(f"starts: got {starts}; give a relief of 0 m or more, and a scale above 0 cells")
+    noise = gaussian_filter(rng.normal(size=shape), (0, starts.scale, starts.scale), mode="reflect")
+    noise -= noise.mean((1, 2), keepdims=True)
+    noise *= starts.relief / np.ptp(noise, axis=(1, 2), keepdims=True)
+    rested = settle_batch(scene, noise.astype(np.float32), stop=UntilStill(bound=200_000))
+    check(rested)
+    return np.asarray(rested.height)
+
+
+def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray]) -> np.ndarray:
+    """What plans of strokes of the unit square leave of maps [G, H, W] (m)."""
+    side = min(scene.grid.shape) * float(scene.grid.spacing) / _GLYPH_MAP
+    low, high = (edge * side for edge in task.GLYPH_SQUARE)
+    push = jax.jit(jax.vmap(env.batching.pushing(env.push, env.settle), in_axes=(None, 0, 0)))
+    heights = jnp.asarray(maps)
+    for k in range(max(map(len, plans))):
+        strokes = np.stack([task.place(some[min(k, len(some) - 1)], (low, high)) for some in plans]).astype(np.float32)
+        after, _ = push(scene, heights, strokes)
+        due = jnp.array([k < len(some) for some in plans]) & jnp.all(jnp.isfinite(after), axis=(1, 2))
+        heights = jnp.where(due[:, None, None], after, heights)
+    return np.asarray(heights)
+
+
+_GLYPH_MAP = 0.32
+"""The side of the map (m) that the glyphs' square is given for."""
