@@ -1,0 +1,94 @@
+"""The networks of DDPG: an actor and a critic that see observations as one vector, or as maps."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+Observation = Any
+"""A vector [B, N], or a dictionary of maps [B, H, W], one of them the "goal" and one "current"."""
+
+_SMALL = nn.initializers.variance_scaling(1e-3, "fan_in", "uniform")  # of last layers: actions and values begin near 0
+
+
+class _Flat(nn.Module):
+    """All of an observation, and more beside it [B, M], in one vector."""
+
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, observation: Observation, *more: jax.Array) -> jax.Array:
+        parts = [leaf.reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(observation)]
+        return _dense(jnp.concatenate([*parts, *more], -1), self.widths)
+
+
+class _Maps(nn.Module):
+    """Both maps and their difference, in blocks of 4 x 4 cells and then coarser; more beside it [B, M] comes in after."""
+
+    channels: tuple[int, ...]
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, observation: Observation, *more: jax.Array) -> jax.Array:
+        goal, current = observation["goal"], observation["current"]
+        x = nn.Conv(self.channels[0], (4, 4), (4, 4))(jnp.stack([goal, current, goal - current], -1))
+        for channels in self.channels[1:]:
+            x = nn.relu(nn.Conv(channels, (3, 3))(nn.relu(x)))
+            x = nn.Conv(channels, (2, 2), (2, 2))(x)
+        x = nn.relu(x).reshape(len(goal), -1)
+        return _dense(jnp.concatenate([x, *more], -1), self.widths)
+
+
+def _dense(x: jax.Array, widths: tuple[int, ...]) -> jax.Array:
+    for width in widths:
+        x = nn.relu(nn.Dense(width)(x))
+    return x
+
+
+@dataclass(frozen=True)
+class Flat:
+    """Fully connected layers on whatever there is to see."""
+
+    widths: tuple[int, ...] = (64, 64)
+
+    def module(self) -> nn.Module:
+        return _Flat(self.widths)
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Convolutions on maps whose sides are multiples of 4 x 2^(n - 1), with n the number of `channels`; then fully
+    connected layers."""
+
+    channels: tuple[int, ...] = (32, 64)
+    widths: tuple[int, ...] = (256, 128)
+
+    def module(self) -> nn.Module:
+        return _Maps(self.channels, self.widths)
+
+
+Sight = Flat | Maps
+
+
+class Actor(nn.Module):
+    """The action [B, A] from -1 to 1 in each entry, and what tanh makes it of."""
+
+    look: nn.Module
+    size: int
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> tuple[jax.Array, jax.Array]:
+        raw = nn.Dense(self.size, kernel_init=_SMALL)(self.look(observation))
+        return jnp.tanh(raw), raw
+
+
+class Critic(nn.Module):
+    """The value [B] of actions [B, A]."""
+
+    look: nn.Module
+
+    @nn.compact
+    def __call__(self, observation: Observation, action: jax.Array) -> jax.Array:
+        return nn.Dense(1, kernel_init=_SMALL)(self.look(observation, action))[:, 0]
