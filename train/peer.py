@@ -1,0 +1,144 @@
+"""Goals such as those of Kreis et al. 2025 (arXiv:2509.06469), rectangles, L shapes and polygons, dug by several methods.
+
+    python -m train.peer [--goals N] [--pushes N] [--seed K] [--json]
+
+A bed of 60 x 30 cells of 10 mm, 30 degrees; rectangles 40 to 60 mm wide and L shapes of 60 to 100 mm, 5 to 20 mm deep,
+polygons 10 to 30 mm deep. The blade here goes as deep as the goal. Their tool is another one, and what they average over is
+not known in every detail, so their figures are a yardstick and this is no race.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib.path import Path as Outline
+
+from jaxsand.files import as_json, as_table, progress
+from jaxsand.optimise import optimise_strokes
+from jaxsand.policy import load_policy
+from jaxsand.sandplan import plan_sand
+from jaxsand.scene import Scene, make_scene
+from jaxsand.stages import Stages, plan_by_policy
+from jaxsand.strokeloss import SandLoss
+from jaxsand.tool import Blade
+
+_SHAPE, _SPACING, _ANGLE = (30, 60), 0.01, math.radians(30)
+_STROKES = 12
+_CHANGED = 0.1  # of the goal's depth
+PUBLISHED = {"method": "Kreis et al. 2025, as published", "mm": 3.4, "changed_percent": 97.0, "strokes": 23.5}
+
+
+@dataclass(frozen=True)
+class PeerGoal:
+    """A `goal` map [H, W] (m) of level sand with a shape dug out of it, and the scene."""
+
+    name: str
+    scene: Scene
+    goal: np.ndarray
+
+
+def peer_goals(count: int, seed: int) -> list[PeerGoal]:
+    """Rectangles, L shapes and polygons in turn, somewhere on the bed."""
+    rng = np.random.default_rng(seed)
+    makers = {"rectangle": _rectangle, "L": _corner, "polygon": _polygon}
+    out = []
+    for k in range(count):
+        name = list(makers)[k % len(makers)]
+        corners = makers[name](rng)
+        depth = rng.uniform(0.01, 0.03) if name == "polygon" else rng.uniform(0.005, 0.02)
+        low, high = corners.min(0), corners.max(0)
+        room = np.array(_SHAPE[::-1]) * _SPACING - 0.04
+        corners = corners - low + 0.02 + rng.random(2) * np.maximum(room - (high - low), 0)
+        y, x = (np.indices(_SHAPE) + 0.5) * _SPACING
+        inside = Outline(corners).contains_points(np.stack([x.ravel(), y.ravel()], 1)).reshape(_SHAPE)
+        scene = make_scene(_SHAPE, _SPACING, _ANGLE, tool=Blade(depth=depth))
+        out.append(PeerGoal(f"{name} {k // len(makers) + 1}", scene, np.where(inside, -depth, 0.0).astype(np.float32)))
+    return out
+
+
+def _rectangle(rng: np.random.Generator) -> np.ndarray:
+    width, length = rng.uniform(0.04, 0.06), rng.uniform(0.06, 0.2)
+    return np.array([[0, 0], [length, 0], [length, width], [0, width]])
+
+
+def _corner(rng: np.random.Generator) -> np.ndarray:
+    (a, b), wide = rng.uniform(0.06, 0.1, 2), 0.03
+    return np.array([[0, 0], [a, 0], [a, wide], [wide, wide], [wide, b], [0, b]])
+
+
+def _polygon(rng: np.random.Generator) -> np.ndarray:
+    angles = np.sort(rng.uniform(0, 2 * math.pi, 6))
+    return rng.uniform(0.03, 0.07, 6)[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
+
+
+def methods(pushes: int, seed: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
+    """What finds strokes [N, 4] (m), at most twelve, by a cost of about so many pushes."""
+    policy = load_policy()
+    return {
+        "policy, looking ahead": lambda s: plan_by_policy(policy, s, _STROKES, Stages(width=6)).strokes,
+        "the same, then gradients": lambda s: plan_by_policy(policy, s, _STROKES, Stages(6, pushes)).strokes,
+        "plan_sand": lambda s: _searched(s, pushes, seed),
+        "optimise_strokes": lambda s: optimise_strokes(s.scene, s.goal, strokes=_STROKES, key=seed, budget=pushes).strokes,
+    }
+
+
+def _searched(sand: SandLoss, pushes: int, seed: int) -> np.ndarray:
+    found = plan_sand(sand.scene, sand.start, sand.goal, strokes=_STROKES, budget=pushes, seed=seed)
+    return np.array([np.concatenate([a, b]) for path in found.paths for a, b in pairwise(path)])
+
+
+def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:
+    """Over the goal's cells: the mean height difference (mm), before and after; the share (%) that changed by more than a
+    tenth of the depth. And the mean difference (mm) over the whole bed, berms too."""
+    dig = goal.goal < 0
+    depth = -float(goal.goal.min())
+    return {
+        "mm": 1e3 * float(np.abs(height - goal.goal)[dig].mean()),
+        "before_mm": 1e3 * depth,
+        "changed_percent": 100 * float((np.abs(height[dig]) > _CHANGED * depth).mean()),
+        "bed_mm": 1e3 * float(np.abs(height - goal.goal).mean()),
+    }
+
+
+def compare(count: int, pushes: int, seed: int, tell: Callable[[str], None]) -> list[dict[str, Any]]:
+    """A row for each method, means over the goals, and the published figures."""
+    goals = peer_goals(count, seed)
+    rows = []
+    for name, find in methods(pushes, seed).items():
+        figures, began = [], time.perf_counter()
+        for goal in goals:
+            tell(f"{name}: {goal.name}")
+            sand = SandLoss(goal.scene, np.zeros(_SHAPE, np.float32), goal.goal)
+            plan = find(sand)
+            height = sand.maps(plan[None])[0] if len(plan) else sand.start
+            figures.append(judged(goal, height) | {"strokes": float(len(plan))})
+        means = {key: float(np.mean([f[key] for f in figures])) for key in figures[0]}
+        rows.append({"method": name, **means, "seconds": (time.perf_counter() - began) / count})
+    return [*rows, PUBLISHED]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m train.peer", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--goals", type=int, default=12, metavar="N", help="goals (12)")
+    parser.add_argument(
+        "--pushes", type=int, default=4000, metavar="N", help="pushes a goal for searches and gradients (4000)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="K")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(arguments)
+    for field in ("goals", "pushes"):
+        if getattr(options, field) < 1:
+            parser.error(f"{field}: got {getattr(options, field)}; give a number of at least 1")
+    rows = compare(options.goals, options.pushes, options.seed, progress())
+    print(as_json({"rows": rows}) if options.json else "\n".join(as_table(rows, "method")))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
