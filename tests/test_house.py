@@ -42,6 +42,7 @@ FLOORS = [
         "calibbench",
         "gradbench",
         "letterbench",
+        "gym",
     },
     {"analysis", "piles", "strokebench"},
     {"render", "rutfigures", "strokefigures", "benchmark"},

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import jax
@@ -11,12 +12,14 @@ from scipy.ndimage import gaussian_filter
 
 from jaxsand import task
 from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
+from jaxsand.env.pushing import Pushing
 from jaxsand.rules import UntilStill
 from jaxsand.scene import Scene
 from jaxsand.settling import settle_batch
 from jaxsand.sim import check
 
 _TRIES = 16
+_GLYPH_MAP = 0.32  # m: the side of the map that the glyphs' square is given for
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.nda
     """What plans of strokes of the unit square leave of maps [G, H, W] (m)."""
     side = min(scene.grid.shape) * float(scene.grid.spacing) / _GLYPH_MAP
     low, high = (edge * side for edge in task.GLYPH_SQUARE)
-    push = jax.jit(jax.vmap(env.batching.pushing(env.push, env.settle), in_axes=(None, 0, 0)))
+    push = _program(env.batching.pushing(env.push, env.settle))
     heights = jnp.asarray(maps)
     for k in range(max(map(len, plans))):
         strokes = np.stack([task.place(some[min(k, len(some) - 1)], (low, high)) for some in plans]).astype(np.float32)
@@ -111,5 +114,6 @@ def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.nda
     return np.asarray(heights)
 
 
-_GLYPH_MAP = 0.32
-"""The side of the map (m) that the glyphs' square is given for."""
+@cache
+def _program(pushing: Pushing) -> Any:
+    return jax.jit(jax.vmap(pushing, in_axes=(None, 0, 0)))

@@ -1,0 +1,165 @@
+"""Gymnasium's interface: its own checkers, goal dictionaries, vectors of environments."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import jaxsand.gym
+from jaxsand.env import LevelGoals, OnlyDug, OnSand, Stop, Together, map_pool
+from jaxsand.goals import letter_map
+from jaxsand.push import SteppedPush
+
+POOL = map_pool([letter_map(name)[0] for name in "LT"])
+RAISED = np.zeros((2, 32, 32), np.float32)
+RAISED[0, 10:12, 8:20] = -0.0075
+RAISED[1, 8:20, 10:12] = -0.0075
+GOALS = LevelGoals(RAISED)
+QUICK = {"goals": GOALS, "push": SteppedPush(1.0, 1), "batching": Together()}
+
+
+def single(**options):
+    return gymnasium.make(jaxsand.gym.SINGLE, goals=POOL, **options)
+
+
+def multi(**options):
+    return gymnasium.make(jaxsand.gym.MULTI, **QUICK | options)
+
+
+@pytest.mark.parametrize("make", [single, multi])
+def test_gymnasium_finds_nothing_wrong(make):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*(infinity|render_fps).*")  # heights have no bounds
+        check_env(make(render_mode="rgb_array").unwrapped)
+
+
+def test_a_seed_makes_an_episode():
+    a, b, c = (single(limit=5).reset(seed=seed) for seed in (3, 3, 4))
+    for name in a[0]:
+        assert np.array_equal(a[0][name], b[0][name])
+    assert any(not np.array_equal(single(limit=5).reset(seed=seed)[0]["goal"], c[0]["goal"]) for seed in range(8))
+
+
+def test_a_single_environment_ends_and_waits():
+    env = multi(limit=2)
+    first, _ = env.reset(seed=0)
+    assert not first["observation"].any()
+    ends = [env.step(np.array([-0.5, -0.3, 0.4, 0.2], np.float32))[2:4] for _ in range(2)]
+    assert ends == [(False, False), (False, True)]
+    assert np.abs(env.unwrapped.shown["current"]).max() > 0.5  # not begun anew
+
+
+def test_a_stop_ends_an_episode_in_place_of_a_push():
+    env = multi(stop=Stop())
+    env.reset(seed=0)
+    obs, reward, terminated, truncated, _ = env.step(np.array([-0.5, -0.3, 0.4, 0.2, 1], np.float32))
+    assert (reward, terminated, truncated) == (0.0, True, False)
+    assert not obs["observation"].any()
+
+
+@pytest.mark.parametrize("measure", [None, OnlyDug()])
+def test_the_reward_is_that_of_the_goal_and_works_on_a_batch(measure):
+    env = multi(**({"measure": measure} if measure else {}))
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(3):
+        obs, reward, _, _, info = env.step(rng.uniform(-1, 1, 4).astype(np.float32))
+        assert reward == env.unwrapped.compute_reward(obs["achieved_goal"], obs["desired_goal"], info)
+        rows.append((obs, reward, info))
+        state, params = env.unwrapped.state, env.unwrapped.params
+        after = float(env.unwrapped.core.distance(state, params))
+        before = state.__class__(state.goal, info["previous"] * params.scene.tool.depth, state.time)
+        assert reward == pytest.approx(float(env.unwrapped.core.distance(before, params)) - after, abs=2e-5)
+    achieved, desired = (np.stack([row[0][name] for row in rows]) for name in ("achieved_goal", "desired_goal"))
+    infos = np.array([row[2] for row in rows])
+    assert env.unwrapped.compute_reward(achieved, desired, infos).tolist() == [row[1] for row in rows]
+    relabelled = env.unwrapped.compute_reward(achieved, achieved, infos)
+    assert (relabelled > 0).all()  # what was reached was the goal
+    with pytest.raises(ValueError, match=r"^info: got one without 'previous'.*copy_info_dict"):
+        env.unwrapped.compute_reward(achieved, desired, [{}] * 3)
+
+
+def test_masks_say_where_the_walk_may_go():
+    env = single()
+    _, info = env.reset(seed=1)
+    for _ in range(6):
+        mask = info["action_mask"]
+        for action in np.flatnonzero(mask == 0):
+            before = env.unwrapped.shown["pose"]
+            obs, *_, info = env.step(int(action))
+            assert not info["legal"]
+            assert np.array_equal(obs["pose"], before)
+        *_, info = env.step(int(np.flatnonzero(mask)[-1]))
+        assert info["legal"]
+
+
+@pytest.mark.parametrize("name", [jaxsand.gym.SINGLE, jaxsand.gym.MULTI])
+def test_a_vector_is_as_many_single_ones(name):
+    options = {"goals": POOL, "limit": 3} if name == jaxsand.gym.SINGLE else QUICK | {"limit": 3}
+    envs = gymnasium.make_vec(name, num_envs=3, **options)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    alone = [gymnasium.make(name, **options) for _ in range(3)]
+    obs, info = envs.reset(seed=7)
+    begun = [env.reset(seed=7 + i) for i, env in enumerate(alone)]
+    assert all(np.array_equal(obs[key][i], one[0][key]) for i, one in enumerate(begun) for key in obs)
+    envs.action_space.seed(0)
+    for step in range(3):
+        actions = envs.action_space.sample()
+        obs, reward, terminated, truncated, info = envs.step(actions)
+        for i, env in enumerate(alone):
+            own = env.step(actions[i])
+            assert (terminated[i], truncated[i]) == own[2:4]
+            assert reward[i] == pytest.approx(own[1], abs=2e-5)
+            seen = obs if step < 2 else info["final_obs"][i]
+            for key in own[0]:
+                assert seen[key][i if step < 2 else ...] == pytest.approx(own[0][key], abs=2e-5)
+            if step < 2 and "previous" in own[4]:
+                assert info["previous"][i] == pytest.approx(own[4]["previous"], abs=2e-5)
+    assert truncated.all()
+    assert info["_final_obs"].all()
+    assert info["_final_info"].all()
+    assert not obs["current" if "pose" in obs else "observation"].sum((1, 2)).any() or "pose" in obs
+    assert envs.observation_space.contains(obs)
+
+
+def test_pictures_show_goal_and_sand():
+    env = multi(render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.dtype == np.uint8
+    assert picture.shape == (256, 520, 3)
+    assert len(np.unique(picture[:, :256].reshape(-1, 3), axis=0)) == 2  # what is to be dug, and what is not
+    assert len(np.unique(picture[:, 264:].reshape(-1, 3), axis=0)) == 1
+    env.step(np.array([-0.5, -0.3, 0.4, 0.2], np.float32))
+    assert len(np.unique(env.render()[:, 264:].reshape(-1, 3), axis=0)) > 20
+    walk = single(render_mode="rgb_array")
+    walk.reset(seed=0)
+    assert (walk.render()[:, 290:, 0] == 149).sum() == 36**2  # 0.7 of the tool, 0.3 of a cell that is dug
+
+
+def test_the_walk_on_sand_is_there_too():
+    env = single(on=OnSand(push=SteppedPush(1.0, 1)))
+    _, info = env.reset(seed=0)
+    obs, reward, *_ = env.step(int(np.argmax(info["action_mask"])))
+    assert obs["current"].min() < -0.9
+    assert reward > 0
+
+
+def test_what_there_is_not_is_named():
+    with pytest.raises(ValueError, match="^render_mode: got 'human'; give rgb_array"):
+        jaxsand.gym.MultiStrokeEnv(render_mode="human", **QUICK)
+    with pytest.raises(ValueError, match="^wind: no option of multi-stroke"):
+        jaxsand.gym.MultiStrokeEnv(wind=3)
+
+
+@pytest.mark.slow
+def test_stable_baselines_finds_nothing_wrong():
+    check = pytest.importorskip("stable_baselines3.common.env_checker").check_env
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check(multi().unwrapped)
+        check(single().unwrapped)
