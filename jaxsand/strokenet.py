@@ -19,6 +19,7 @@ Params = Any
 
 _STARTS = 32  # peaks of the starts
 _ENDS = 12  # peaks of the ends from each
+_LINES = 96  # of the likeliest pairs of these, along which the network looks
 _TRUST = 0.3  # in the likelihoods of ends, beside what is seen along the line
 _ALONG = 12  # places that are looked at from end to end
 _BEYOND = 1.5  # cells: and one before and one behind
@@ -214,7 +215,7 @@ def likeliest(due: Callable[[Scores, jax.Array], jax.Array], scores: Scores, cou
 
 
 def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
-    """Strokes between peaks, of one map: [S E, 4] (cells), and the logarithms of their likelihoods."""
+    """The likeliest strokes between peaks, of one map: [96, 4] (cells), and the logarithms of their likelihoods."""
     rows, columns = scores.start.shape
     query, key = (x.reshape(rows * columns, -1) for x in (scores.query, scores.key))
     begin = jnp.exp(scores.start)
@@ -225,7 +226,8 @@ def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
     b = jax.vmap(lambda share, cells: jax.vmap(lambda cell: _centre(share, cell))(cells))(end, last)
     strokes = jnp.concatenate([jnp.broadcast_to(a[:, None], b.shape), b], -1)
     both = jnp.log(jnp.maximum(p, 1e-9))[:, None] + jnp.log(jnp.maximum(q, 1e-9))
-    return strokes.reshape(-1, 4), both.ravel()
+    log_shares, which = jax.lax.top_k(both.ravel(), _LINES)
+    return strokes.reshape(-1, 4)[which], log_shares
 
 
 def _peaks(share: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:

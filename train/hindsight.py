@@ -32,7 +32,7 @@ from train.sand import CELLS, SPACING, other_scene, starts, usual_scene
 _WEIGHT = 2.0  # of the loss of pairs
 _SAME, _OTHER = 1.0, 2.5  # cells: nearer than that to a due stroke is one, farther is none
 _SET_APART = 1_000_003  # the seed of the goals that it is validated on
-_TRIALS = 128  # such goals
+_TRIALS = 64  # such goals
 
 
 @jax.tree_util.register_dataclass
