@@ -1,0 +1,73 @@
+"""Learning curves of runs: the validation score against wall time and against strokes simulated.
+
+python -m train.curves RUN [RUN ...] --out FILE.png
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxsand.files import existing, written
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_COUNTS = ("pushes", "strokes", "steps")  # what a chunk's row may count, by the learner
+
+
+def curve(run: Path) -> dict[str, np.ndarray]:
+    """The validations of a run: minutes, what was simulated up to then, and the score.
+
+    Raises:
+      ValueError: when the folder holds no metrics.
+    """
+    rows = [json.loads(line) for line in existing(run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    done, points = 0.0, []
+    for row in rows:
+        if row["kind"] == "validate":
+            points.append((row["seconds"] / 60, done, row["score"]))
+        else:
+            done += next((row[name] for name in _COUNTS if name in row), 0.0)
+    if not points:
+        raise ValueError(f"run: {run} holds no validation yet; train it on with --resume")
+    return dict(zip(("minutes", "simulated", "score"), np.array(points).T, strict=True))
+
+
+def curves_figure(curves: dict[str, dict[str, np.ndarray]]) -> "Figure":
+    """A line for each run, against wall time and against what was simulated."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for name, points in curves.items():
+        for ax, by in zip(axes, ("minutes", "simulated"), strict=True):
+            ax.plot(points[by], points["score"], "o-", ms=3, label=name)
+    axes[0].set(xlabel="minutes", ylabel="validation score", ylim=(0, 1))
+    axes[1].set(xlabel="strokes or steps simulated")
+    for ax in axes:
+        ax.grid(alpha=0.3)
+    axes[0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser: Any = argparse.ArgumentParser(prog="python -m train.curves", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
+    options = parser.parse_args(arguments)
+    try:
+        figure = curves_figure({run.name: curve(run) for run in options.runs})
+        with written(options.out) as path:
+            figure.savefig(path, dpi=110, format="png")
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
