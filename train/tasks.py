@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.env.library import Level, RandomStrokes, library
-from jaxsand.env.multi import MultiStroke, StrokeParams
+from jaxsand import task
+from jaxsand.env.library import RandomStrokes
+from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.lookahead import one_after_the_other
+from jaxsand.strokeloss import pushed
 from jaxsand.success import right
 from jaxsand.tool import Blade
 from train.actor import Acts
@@ -77,6 +79,10 @@ Task = Strokes | Probing
 
 @cache
 def _goals(count: int, goals: int, seed: int) -> StrokeParams:
+    """The environment's parameters, with goals that random strokes leave; none whose outcome is not clean."""
     scene = usual_scene()
-    pool = library(_ENV, scene, RandomStrokes(goals, count, count, _SHORTEST), Level(), seed)
-    return StrokeParams(scene, pool, count)
+    plans = np.stack(RandomStrokes(goals, count, count, _SHORTEST).plans(np.random.default_rng(seed)))
+    maps = np.zeros((goals, *scene.grid.shape), np.float32)
+    for k in range(count):
+        maps = pushed(scene, maps, task.place(plans[:, k]))
+    return StrokeParams(scene, LevelGoals(jnp.asarray(maps[np.isfinite(maps).all((1, 2))])), count)

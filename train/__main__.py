@@ -1,0 +1,95 @@
+"""The command line of the learners: `python -m train --help`. Mistakes end as those of `jaxsand` do."""
+
+import argparse
+import math
+import sys
+from typing import Any
+
+from jaxsand.__main__ import _count, _fail, _keep_compiled_programs, _Parser, _path, _seed
+from train.commands import MINUTES, SHIPPED, Stopped, run_evaluation, run_shipping, run_training
+
+_STEPS = {
+    "hindsight": "chunks of lessons",
+    "dqn": "chunks: steps in all its environments, then updates",
+    "ddpg": "chunks: an episode in each of its 64 environments, then updates",
+}
+_ABOUT = {
+    "hindsight": "the policy that jaxsand ships: which of random strokes are still to come",
+    "dqn": "the single stroke on maps",
+    "ddpg": "strokes by DDPG with hindsight experience replay",
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
+    options = _parser().parse_args(arguments)
+    _keep_compiled_programs()
+    try:
+        options.command(options)
+    except ValueError as error:
+        return _fail(str(error))
+    except (KeyboardInterrupt, Stopped) as error:
+        print(str(error) or "stopped", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="python -m train", description="Learners that shape sand. Every command answers --help.")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    for learner in MINUTES:
+        _training(commands, learner)
+    _evaluation(commands)
+    _shipping(commands)
+    return parser
+
+
+def _training(commands: Any, learner: str) -> None:
+    p = commands.add_parser(learner, help=_ABOUT[learner], description=f"Trains {_ABOUT[learner]}.")
+    end = p.add_mutually_exclusive_group()
+    of_paper = ", or 10,000 episodes with --paper" if learner == "ddpg" else ""
+    end.add_argument("--minutes", type=_minutes, metavar="M", help=f"minutes of work ({MINUTES[learner]:g}{of_paper})")
+    end.add_argument("--steps", type=_count, metavar="N", help=_STEPS[learner])
+    p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of everything drawn by chance (0)")
+    p.add_argument("--out", type=_path, metavar="RUN", help=f"folder of the run (runs/{learner}-SEED)")
+    p.add_argument("--resume", action="store_true", help="go on with the run there; minutes and steps count from its start")
+    p.add_argument("--tensorboard", action="store_true", help="write its metrics for TensorBoard as well")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    if learner == "ddpg":
+        p.add_argument("--paper", action="store_true", help="the paper's setting: 10,000 episodes (runs/ddpg-paper-SEED)")
+    p.set_defaults(command=run_training, learner=learner, paper=False)
+
+
+def _evaluation(commands: Any) -> None:
+    p = commands.add_parser("evaluate", help="how many glyphs, or for dqn letter maps, a run gets right")
+    p.add_argument("run", metavar="RUN|pretrained", help="folder of a run, whose best state is used, or what jaxsand ships")
+    which = p.add_mutually_exclusive_group()
+    which.add_argument("--glyphs", type=_path, metavar="FILE.json", help="names, each with strokes of the unit square")
+    which.add_argument("--goals", metavar="NAME", help="a set of goals (letters); a wrong name lists them")
+    p.add_argument("--lookahead", type=_count, metavar="K", help="try its K best actions on K plans, with the simulator")
+    p.add_argument("--refine", action="store_true", help="improve its plan by gradients through the simulator")
+    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the report and a picture of goals and results")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(command=run_evaluation)
+
+
+def _shipping(commands: Any) -> None:
+    p = commands.add_parser("ship", help="make the best policy of a hindsight run the one that jaxsand comes with")
+    p.add_argument("run", type=_path, metavar="RUN", help="folder of the run")
+    p.add_argument("--out-file", type=_path, default=SHIPPED, metavar="FILE.npz", help="another place for it")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(command=run_shipping)
+
+
+def _minutes(text: str) -> float:
+    try:
+        minutes = float(text)
+    except ValueError:
+        minutes = math.nan
+    if not 0 < minutes < math.inf:
+        raise argparse.ArgumentTypeError(f"got {text!r}, which is no number above 0")
+    return minutes
+
+
+if __name__ == "__main__":
+    sys.exit(main())

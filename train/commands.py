@@ -1,0 +1,179 @@
+"""What the commands of `train` do."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jaxsand
+from jaxsand.commands.printing import lines, show
+from jaxsand.files import as_json, as_table, existing, folder, progress, written
+
+MINUTES = {"hindsight": 30.0, "dqn": 10.0, "ddpg": 10.0}
+"""How long each learner trains unless it is told."""
+
+EPISODES = 10_000
+"""Of the paper's setting."""
+
+SHIPPED = Path(jaxsand.__file__).parent / "data" / "policy.npz"
+"""Where the policy lies that jaxsand comes with."""
+
+_POLISH = 4_000  # calls of the simulator for --refine
+
+
+class Stopped(Exception):  # noqa: N818
+    """A run was asked to stop, and did."""
+
+
+def run_training(options: argparse.Namespace) -> None:
+    """Trains one learner, and says where it is and what it reached."""
+    if options.tensorboard:
+        _tensorboard_writer()
+    tell = progress()
+    tell(f"{options.learner}: getting ready")
+    learner, steps = _learner(options)
+    minutes, steps = options.minutes, options.steps or steps
+    if minutes is None and steps is None:
+        minutes = MINUTES[options.learner]
+    name = "ddpg-paper" if options.paper else options.learner
+    out = options.out or Path("runs") / f"{name}-{options.seed}"
+    from train.runs import run
+
+    with _watch(out, options.tensorboard) as watch:
+        ran = run(learner, out, options.seed, minutes=minutes, steps=steps, resume=options.resume, tell=tell, watch=watch)
+    tell("")
+    report = {"run": str(out), "chunks": ran.chunk, "minutes": round(ran.seconds / 60, 3), "best_score": ran.score}
+    show(options, report, lines)
+    if ran.stopped:
+        raise Stopped(f"stopped; go on with --resume --out {out}")
+
+
+def run_evaluation(options: argparse.Namespace) -> None:
+    """How many glyphs, or letter maps, a run's best state gets right."""
+    tell = progress()
+    tell("getting ready")
+    out = folder(options.out) if options.out else None
+    if options.run == "pretrained":
+        from jaxsand.policy import load_policy
+
+        report = _on_sand(load_policy(), options, tell, out)
+    else:
+        from train.runs import learner_of, load
+
+        learner: Any = learner_of(Path(options.run))
+        state = load(Path(options.run), learner)
+        if learner.name == "dqn":
+            report = _on_maps(learner, state, options, tell)
+        else:
+            report = _on_sand(learner.policy(state), options, tell, out)
+    if out:
+        with written(out / "evaluate.json") as path:
+            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+    tell("")
+    show(options, report, _evaluated)
+
+
+def run_shipping(options: argparse.Namespace) -> None:
+    """Writes a run's best policy where jaxsand looks for it, with how it was made."""
+    from jaxsand.policy import save_policy
+    from train.hindsight import Hindsight
+    from train.runs import about_run, learner_of, load, seed_of
+
+    learner = learner_of(options.run)
+    if not isinstance(learner, Hindsight):
+        raise ValueError(f"run: got one of {learner.name}; jaxsand ships what hindsight learned")
+    at, seed = about_run(options.run), seed_of(options.run)
+    about = {
+        "command": f"python -m train hindsight --seed {seed}",
+        "seed": seed,
+        "chunks": at.chunk,
+        "minutes": round(at.seconds / 60, 2),
+        "score": round(at.score, 4),
+    }
+    policy = learner.policy(load(options.run, learner))
+    with written(options.out_file) as path:
+        save_policy(policy, path, **about)
+    show(options, {"file": str(options.out_file), "bytes": options.out_file.stat().st_size, **about}, lines)
+
+
+def _learner(options: argparse.Namespace) -> tuple[Any, int | None]:
+    """The learner, and after how many chunks it ends by itself."""
+    if options.learner == "hindsight":
+        from train.hindsight import Hindsight
+
+        return Hindsight(), None
+    if options.learner == "dqn":
+        from train.dqn import Dqn
+
+        return Dqn(), None
+    from train.ddpg import Ddpg
+
+    paper = Ddpg.paper()
+    return (paper, None if options.minutes else paper.chunks(EPISODES)) if options.paper else (Ddpg(), None)
+
+
+def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None) -> dict[str, Any]:
+    from jaxsand.stages import Stages
+    from train.evaluate import evaluate, picture
+    from train.glyphs import SETS, read_glyphs
+
+    if options.goals is not None and options.goals not in SETS:
+        raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(SETS)}")
+    glyphs = read_glyphs(existing(options.glyphs)) if options.glyphs else SETS[options.goals or "letters"]()
+    stages = Stages(options.lookahead or 0, _POLISH if options.refine else 0)
+    report = evaluate(policy, glyphs, stages, tell)
+    if out:
+        from jaxsand.render import save_figure
+
+        with written(out / "evaluate.png") as path:
+            save_figure(picture(glyphs, report), path)
+    return report
+
+
+def _on_maps(learner: Any, state: Any, options: argparse.Namespace, tell: Callable[[str], None]) -> dict[str, Any]:
+    for option in ("glyphs", "goals", "refine"):
+        if getattr(options, option):
+            raise ValueError(f"{option}: has an effect on strokes only, and dqn walks over maps; leave it out")
+    from train.evaluate_maps import evaluate
+
+    report: dict[str, Any] = evaluate(learner, state, width=options.lookahead or 0, tell=tell)
+    return report
+
+
+def _evaluated(report: dict[str, Any]) -> str:
+    """A row for every glyph or map, then the sums."""
+    kind = "glyphs" if "glyphs" in report else "maps"
+    rows = [{"name": name, **row} for name, row in report[kind].items()]
+    table = as_table([{k: v for k, v in row.items() if k != "pushes"} for row in rows], kind)
+    return "\n".join([*table, "", lines({k: v for k, v in report.items() if k != kind})])
+
+
+@contextmanager
+def _watch(out: Path, wanted: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """What is told of every row of a run's metrics: nothing, or a TensorBoard writer."""
+    if not wanted:
+        yield lambda _: None
+        return
+    writers: list[Any] = []
+
+    def watch(row: dict[str, Any]) -> None:
+        if not writers:  # what was written after the checkpoint that a run goes on from is void
+            writers.append(_tensorboard_writer()(str(out / "tensorboard"), purge_step=row["chunk"]))
+        for name, value in row.items():
+            if name not in ("kind", "chunk"):
+                writers[0].add_scalar(f"{row['kind']}/{name}", value, row["chunk"])
+
+    try:
+        yield watch
+    finally:
+        for writer in writers:
+            writer.close()
+
+
+def _tensorboard_writer() -> Any:
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise ValueError("tensorboard: tensorboardX is not installed; pip install tensorboardX, or leave it out") from None
+    return SummaryWriter
