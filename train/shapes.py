@@ -1,0 +1,95 @@
+"""Random maps drawn the way letters are: a few straight lines, across, along or in stairs, each from a cell already dug."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxsand.env.maps import STEPS, MapPool
+
+_FEWEST, _MOST = 6, 16  # lines
+_SHORTEST, _LONGEST = 2, 6  # steps of a line
+_SECOND = np.array([0, 1, 2, 3, 1, 2, 3, 0])  # a line's odd steps, by its way; its even ones are 0, 1, 2, 3, 0, 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Six to sixteen lines of two to six steps, of which the map's edge, and the other lines, take a part in.
+
+    Lines start at the last one's end with probability `onward`, else on any cell, and are stairs with probability
+    `stairs`. One that would fill a block of 2 x 2 cells is left out with probability `thin`: letters are one cell wide.
+    The stroke starts on any cell.
+    """
+
+    onward: float = 0.4
+    stairs: float = 0.2
+    thin: float = 0.9
+
+    def draw(self, key: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
+        """A map [H, W] (bool) and its start [2] (row, column)."""
+        key, begin, many, choose = jax.random.split(key, 4)
+        first = jax.random.randint(begin, (2,), 0, jnp.asarray(shape), jnp.int32)
+        count = jax.random.randint(many, (), _FEWEST, _MOST + 1)
+
+        def one(k: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            dig, end = carry
+            where, which, kind, long, keep, slope = jax.random.split(jax.random.fold_in(key, k), 6)
+            place = jnp.where(jax.random.uniform(which) < self.onward, end, _any_of(where, dig))
+            way = jax.random.randint(kind, (), 0, 4) + 4 * (jax.random.uniform(slope) < self.stairs)
+            new, there = _line(dig, place, way, jax.random.randint(long, (), _SHORTEST, _LONGEST + 1))
+            blocked = (_blocks(new) > _blocks(dig)) & (jax.random.uniform(keep) < self.thin)
+            good = (k < count) & ~blocked
+            return jnp.where(good, new, dig), jnp.where(good, there, end)
+
+        dig = jnp.zeros(shape, bool).at[first[0], first[1]].set(True)
+        dig = lax.fori_loop(0, _MOST, one, (dig, first))[0]
+        return dig, _any_of(choose, dig)
+
+
+@partial(jax.jit, static_argnames=("shapes", "count", "shape"))
+def shape_pool(shapes: Shapes, key: jax.Array, count: int, shape: tuple[int, int], barred: jax.Array) -> MapPool:
+    """So many random maps, but for those `barred` [N, H, W], for which the first that is not stands in; see `among`."""
+    dig, starts = jax.vmap(lambda k: shapes.draw(k, shape))(jax.random.split(key, count))
+    out = among(dig, barred)
+    own = jnp.where(out, jnp.argmin(out), jnp.arange(count))
+    return MapPool(dig[own], starts[own])
+
+
+def among(dig: jax.Array, barred: jax.Array) -> jax.Array:
+    """Which maps [G, H, W] are one of the maps [N, H, W], shifted or as it is [G]."""
+    ours, theirs = jax.vmap(_to_corner)(dig), jax.vmap(_to_corner)(barred)
+    return jnp.any(jnp.all(ours[:, None] == theirs[None], axis=(2, 3)), axis=1)
+
+
+def _to_corner(dig: jax.Array) -> jax.Array:
+    """The map shifted up and left as far as it goes."""
+    up, left = (jnp.argmax(jnp.any(dig, axis=axis)) for axis in (1, 0))
+    return jnp.roll(dig, jnp.stack([-up, -left]), (0, 1))
+
+
+def _any_of(key: jax.Array, dig: jax.Array) -> jax.Array:
+    """The row and column of a true cell, each as likely."""
+    odds = jnp.where(dig.ravel(), jnp.float32(0), -jnp.inf)
+    return jnp.stack(jnp.divmod(jax.random.categorical(key, odds), dig.shape[1])).astype(jnp.int32)
+
+
+def _line(dig: jax.Array, place: jax.Array, way: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The map with one line more, and where that ends."""
+    both = jnp.asarray(STEPS)[jnp.stack([way % 4, jnp.asarray(_SECOND)[way]])]
+
+    def one(t: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        dig, place = carry
+        there = place + both[t % 2]
+        good = (t < steps) & jnp.all((there >= 0) & (there < jnp.asarray(dig.shape)))
+        place = jnp.where(good, there, place)
+        return dig.at[place[0], place[1]].set(True), place
+
+    return lax.fori_loop(0, _LONGEST, one, (dig, place))
+
+
+def _blocks(dig: jax.Array) -> jax.Array:
+    """How many blocks of 2 x 2 cells are true."""
+    return jnp.sum(dig[1:, 1:] & dig[:-1, 1:] & dig[1:, :-1] & dig[:-1, :-1])
