@@ -121,11 +121,24 @@ def _bench(commands: Any) -> None:
     p.add_argument(
         "what",
         nargs="?",
-        choices=["settle", "push", "plan", "grad", "calibrate", "sand", "strokes", "trench", "all", "stability", "letters"],
+        choices=[
+            "settle",
+            "push",
+            "plan",
+            "env",
+            "grad",
+            "calibrate",
+            "sand",
+            "strokes",
+            "trench",
+            "all",
+            "stability",
+            "letters",
+        ],
         default="all",
     )
     p.add_argument(
-        "--batch", type=_count, metavar="N", help="maps in a batch (4096; grad: 64, if given larger maps as well)"
+        "--batch", type=_count, metavar="N", help="maps in a batch (4096; env: 1024; grad: 64, if given larger maps as well)"
     )
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
     p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of the searches on sand, the first for strokes (0)")

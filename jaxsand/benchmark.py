@@ -22,6 +22,7 @@ from jaxsand import (
     analysis,
     calibbench,
     complexity,
+    envbench,
     expansions,
     gradbench,
     piles,
@@ -63,13 +64,13 @@ def bench(
     seed: int = 0,
     **strokes: Any,
 ) -> dict[str, Any]:
-    """The figures for `what`: settle, push, plan, or all of these; grad, calibrate, sand, strokes, trench, stability,
-    or letters.
+    """The figures for `what`: settle, push, plan, or all of these; env, grad, calibrate, sand, strokes, trench,
+    stability, or letters.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
-    `batch` is 4096, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`.
+    `batch` is 4096, for env 1024, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`.
     """
-    larger, batch = batch, batch or (64 if what == "grad" else 4096)
+    larger, batch = batch, batch or {"grad": 64, "env": 1024}.get(what, 4096)
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
@@ -99,15 +100,17 @@ def bench(
         report["sand"] = sandbench.bench_sand(tell, seed=seed)
     if what == "strokes":
         report |= strokebench.bench_strokes(tell, **strokes)
-    if what == "calibrate":
-        report["calibrate"] = calibbench.bench_calibrate(tell)
     if what == "trench":
         report["trench_by_spacing"] = rutbench.against_spacing(tell, grids + 1)
         report["trench_settles"] = rutbench.settling(tell)
-    if what == "stability":
-        report["stability"] = stability.stability(tell=tell)
-    if what == "letters":
-        report["letters"] = bench_letters(tell)
+    of_one_table = {
+        "env": lambda: envbench.bench_env(batch, tell),
+        "calibrate": lambda: calibbench.bench_calibrate(tell),
+        "stability": lambda: stability.stability(tell=tell),
+        "letters": lambda: bench_letters(tell),
+    }
+    if what in of_one_table:
+        report[what] = of_one_table[what]()
     return report
 
 

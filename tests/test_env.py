@@ -40,9 +40,9 @@ def on_sand():
 
 
 def batch(env, params, count):
-    keys = jax.random.split(KEY, count)
+    keys, draws = (jax.random.split(key, count) for key in jax.random.split(KEY))
     obs, state = jax.vmap(env.reset, (0, None))(keys, params)
-    actions = jax.vmap(env.action_space(params).sample)(keys)
+    actions = jax.vmap(env.action_space(params).sample)(draws)
     return keys, obs, state, actions
 
 
@@ -318,7 +318,7 @@ def test_spaces_know_what_belongs_to_them():
     both = envs.Dict({"a": box, "b": choice})
     assert both.contains(both.sample(KEY))
     assert not both.contains({"a": jnp.zeros(3)})
-    drawn = jax.vmap(envs.Box(0, jnp.inf, ()).sample)(jax.random.split(KEY, 64))
+    drawn = jax.jit(jax.vmap(envs.Box(0, jnp.inf, ()).sample))(jax.random.split(KEY, 64))
     assert (drawn >= 0).all()
     assert drawn.max() > 1
     assert jax.vmap(envs.Box(-jnp.inf, jnp.inf, ()).sample)(jax.random.split(KEY, 64)).min() < -1

@@ -44,7 +44,7 @@ FLOORS = [
         "letterbench",
         "gym",
     },
-    {"analysis", "piles", "strokebench"},
+    {"analysis", "piles", "strokebench", "envbench"},
     {"render", "rutfigures", "strokefigures", "benchmark"},
     {"commands"},
     {"__main__"},

@@ -1,5 +1,6 @@
 """What an action or an observation may be: boxes, choices, and dictionaries of these."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,12 +20,12 @@ class Box:
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Uniform between the bounds; where one is infinite, normal about the other, or about 0."""
-        if jnp.isfinite(self.low) and jnp.isfinite(self.high):
+        if math.isfinite(self.low) and math.isfinite(self.high):
             return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
         drawn = jax.random.normal(key, self.shape, self.dtype)
-        if jnp.isfinite(self.low):
+        if math.isfinite(self.low):
             return self.low + jnp.abs(drawn)
-        return self.high - jnp.abs(drawn) if jnp.isfinite(self.high) else drawn
+        return self.high - jnp.abs(drawn) if math.isfinite(self.high) else drawn
 
     def contains(self, x: Any) -> jax.Array:
         """Whether x has the shape and lies within the bounds."""
