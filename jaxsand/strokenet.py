@@ -60,8 +60,8 @@ class _Look(nn.Module):
     @nn.compact
     def __call__(self, goal: jax.Array, current: jax.Array) -> Scores:
         rows, columns = goal.shape[1:]
-        y, x = jnp.meshgrid(jnp.linspace(-1, 1, rows), jnp.linspace(-1, 1, columns), indexing="ij")
-        place = [jnp.broadcast_to(v, goal.shape) for v in (x, y)]
+        y, x = (jnp.linspace(-1, 1, n, dtype=goal.dtype) for n in (rows, columns))
+        place = [jnp.broadcast_to(v, goal.shape) for v in (x[None, None, :], y[None, :, None])]
         raw = jnp.stack([goal, current, goal - current], -1)
         x = _folded(jnp.concatenate([raw, jnp.stack(place, -1)], -1), 2)
         x = nn.Conv(self.widths[0], (3, 3))(x)
@@ -121,10 +121,10 @@ def seen_along(sight: jax.Array, strokes: jax.Array) -> jax.Array:
     """What lies along strokes [B, P, 4] (cells), bilinear, from a little before to a little behind: [B, V, P, L, C]."""
     a, b = strokes[..., None, :2], strokes[..., None, 2:]
     ahead = (b - a) / jnp.maximum(jnp.linalg.norm(b - a, axis=-1, keepdims=True), 1e-6)
-    part = jnp.linspace(0, 1, _ALONG)[:, None]
+    part = jnp.linspace(0, 1, _ALONG, dtype=sight.dtype)[None, None, :, None]
     points = jnp.concatenate([a - _BEYOND * ahead, a + part * (b - a), b + _BEYOND * ahead], -2)
     batch, views, rows, columns, channels = sight.shape
-    at = jnp.clip(points - 0.5, 0, jnp.array([columns - 1.001, rows - 1.001]))
+    at = jnp.stack([jnp.clip(points[..., k] - 0.5, 0, n - 1.001) for k, n in enumerate((columns, rows))], -1)
     low = jnp.floor(at).astype(jnp.int32)
     part = at - low
     flat = sight.reshape(batch, views, rows * columns, channels)
@@ -160,9 +160,14 @@ def spread(points: jax.Array, shape: tuple[int, int]) -> jax.Array:
     rows, columns = shape
     x = jnp.clip(points[..., 0, None] - 0.5, 0, columns - 1)
     y = jnp.clip(points[..., 1, None] - 0.5, 0, rows - 1)
-    across = jnp.maximum(1 - jnp.abs(x - jnp.arange(columns)), 0)
-    along = jnp.maximum(1 - jnp.abs(y - jnp.arange(rows)), 0)
+    across = jnp.maximum(1 - jnp.abs(x - _counted(columns, x)), 0)
+    along = jnp.maximum(1 - jnp.abs(y - _counted(rows, y)), 0)
     return along[..., :, None] * across[..., None, :]
+
+
+def _counted(count: int, like: jax.Array) -> jax.Array:
+    """0, 1, 2, ... along the last axis of as many axes."""
+    return jnp.arange(count, dtype=like.dtype).reshape(*[1] * (like.ndim - 1), count)
 
 
 def ends(scores: Scores, starts: jax.Array) -> jax.Array:
@@ -206,7 +211,7 @@ def likeliest(due: Callable[[Scores, jax.Array], jax.Array], scores: Scores, cou
     def pick(strokes: jax.Array, score: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(score: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             best = jnp.argmax(score)
-            like = jnp.max(jnp.abs(strokes - strokes[best]), -1) < 1.5
+            like = jnp.max(jnp.abs(strokes - strokes[best][None]), -1) < 1.5
             return jnp.where(like, score - 1e3, score), (strokes[best], score[best])
 
         return jax.lax.scan(one, score, None, length=count)[1]
@@ -216,13 +221,12 @@ def likeliest(due: Callable[[Scores, jax.Array], jax.Array], scores: Scores, cou
 
 def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
     """The likeliest strokes between peaks, of one map: [96, 4] (cells), and the logarithms of their likelihoods."""
-    rows, columns = scores.start.shape
-    query, key = (x.reshape(rows * columns, -1) for x in (scores.query, scores.key))
     begin = jnp.exp(scores.start)
     p, first = _peaks(begin, _STARTS)
-    end = jnp.exp(_log_share((query[first] @ key.T).reshape(-1, rows, columns)))
-    q, last = jax.vmap(lambda share: _peaks(share, _ENDS))(end)
     a = jax.vmap(lambda cell: _centre(begin, cell))(first)
+    query = jnp.einsum("pij,ijk->pk", spread(a, begin.shape), scores.query)
+    end = jnp.exp(_log_share(jnp.einsum("pk,ijk->pij", query, scores.key)))
+    q, last = jax.vmap(lambda share: _peaks(share, _ENDS))(end)
     b = jax.vmap(lambda share, cells: jax.vmap(lambda cell: _centre(share, cell))(cells))(end, last)
     strokes = jnp.concatenate([jnp.broadcast_to(a[:, None], b.shape), b], -1)
     both = jnp.log(jnp.maximum(p, 1e-9))[:, None] + jnp.log(jnp.maximum(q, 1e-9))
@@ -242,5 +246,5 @@ def _centre(share: jax.Array, cell: jax.Array) -> jax.Array:
     rows, columns = share.shape
     y, x = jnp.meshgrid(jnp.arange(rows), jnp.arange(columns), indexing="ij")
     near = (jnp.abs(y - cell // columns) <= 1) & (jnp.abs(x - cell % columns) <= 1)
-    weight = jnp.where(near, share, 0) + jnp.where(near, 1e-12, 0)
+    weight = jnp.where(near, share + 1e-12, 0)
     return jnp.stack([jnp.sum(weight * (x + 0.5)), jnp.sum(weight * (y + 0.5))]) / jnp.sum(weight)

@@ -97,8 +97,17 @@ BAD = {
     "search for a drawn goal": (["shape", "l.txt", "--method", "search"], "method: 'search' compares berms too"),
     "pushes without a search": (
         ["shape", "L", "--pushes", "9"],
-        "pushes: has an effect with --method search or optimise only",
+        "pushes: has an effect with --method search, optimise or policy only",
     ),
+    "looking ahead without a policy": (
+        ["shape", "L", "--lookahead", "2"],
+        "lookahead: has an effect with --method policy only",
+    ),
+    "pushes of a policy alone": (
+        ["shape", "L", "--method", "policy", "--pushes", "9"],
+        "pushes: .*add that, or leave it out",
+    ),
+    "policy for a drawn goal": (["shape", "l.txt", "--method", "policy"], "method: 'policy' compares berms too"),
     "plan to nowhere": (["plan", "l.txt", "--end", "0,2"], r"end: got \(0, 2\)"),
     "plan to no cell": (["plan", "l.txt", "--end", "here"], "end: got 'here'"),
     "plan in no time": (["plan", "l.txt", "--seconds", "0"], "seconds: got 0.0"),
@@ -227,6 +236,19 @@ def test_search_on_real_sand(here, capsys):
     assert found["before"] == pytest.approx(np.linalg.norm(goal), rel=1e-5)
     assert 0 < found["full_pushes"] <= found["rollouts"]
     assert all((here / file).exists() for file in report["files"])
+
+
+def test_the_policy_trenches_a_letter(here, capsys):
+    assert main(["shape", "T", "--method", "policy", "--out", "alone", "--json"]) == 0
+    alone = json.loads(capsys.readouterr().out)
+    assert (alone["method"], alone["goal_kind"], alone["steps"]) == ("policy", "glyph", 2)
+    assert alone["search"]["rollouts"] == 2
+    assert alone["iou"] > 0.6
+    assert main(["shape", "T", "--method", "policy", "--lookahead", "3", "--strokes", "4", "--out", "ahead", "--json"]) == 0
+    ahead = json.loads(capsys.readouterr().out)
+    assert ahead["search"]["after"] <= alone["search"]["after"]
+    assert ahead["l2_reduction"] == pytest.approx(1 - ahead["search"]["after"] / ahead["search"]["before"], abs=1e-3)
+    assert ahead["iou"] > 0.8
 
 
 @pytest.mark.parametrize("goal", ["white-S.png", "dip.npy", "terrain", "7"])

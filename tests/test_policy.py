@@ -1,5 +1,7 @@
 """The policy's network, how strokes are read off it, and its file."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,18 +16,23 @@ NET = StrokeNet((8, 8, 8), (1, 1, 1))
 SIDE = 32
 
 
+look = jax.jit(partial(NET.apply, method="look"))
+due = jax.jit(partial(NET.apply, method="due"))
+of_all_views = jax.jit(partial(symmetric, NET))
+
+
 def maps(seed, count=2):
     return jnp.asarray(np.random.default_rng(seed).standard_normal((count, SIDE, SIDE)), jnp.float32)
 
 
 @pytest.fixture(scope="module")
 def params():
-    variables = NET.init(jax.random.key(0), maps(0), maps(1), jnp.zeros((2, 1, 4), jnp.float32))
-    return jax.tree.map(lambda p: p + 0.1 * jnp.sin(jnp.arange(p.size, dtype=p.dtype)).reshape(p.shape), variables)
+    variables = jax.jit(NET.init)(jax.random.key(0), maps(0), maps(1), jnp.zeros((2, 1, 4), jnp.float32))
+    return jax.tree.map(lambda p: p + 0.1 * np.sin(np.arange(p.size, dtype=p.dtype)).reshape(p.shape), variables)
 
 
 def test_starts_and_ends_are_shares_of_one(params):
-    scores = NET.apply(params, maps(0), maps(1), method="look")
+    scores = look(params, maps(0), maps(1))
     np.testing.assert_allclose(jnp.exp(scores.start).sum((1, 2)), 1, rtol=1e-5)
     points = jnp.array([[[3.2, 4.9]], [[31.9, 0.0]]], jnp.float32)
     np.testing.assert_allclose(jnp.exp(ends(scores, points)).sum((2, 3)), 1, rtol=1e-5)
@@ -51,14 +58,14 @@ def test_lines_see_what_lies_on_them():
 def test_what_is_symmetric_turns_with_its_maps(params):
     goal, current = maps(0), maps(1)
     strokes = jnp.array([[[4.0, 8.0, 20.0, 24.0], [9.0, 3.0, 11.0, 30.0]]] * 2, jnp.float32)
-    one = symmetric(NET, params, goal, current)
-    odds = NET.apply(params, one, strokes, method="due")
+    one = of_all_views(params, goal, current)
+    odds = due(params, one, strokes)
     for flip in (False, True):
         turn = (lambda x: jnp.flip(x, 2)) if flip else (lambda x: x.swapaxes(1, 2))
         moved = strokes.at[..., ::2].set(SIDE - strokes[..., ::2]) if flip else strokes[..., jnp.array([1, 0, 3, 2])]
-        other = symmetric(NET, params, turn(goal), turn(current))
+        other = of_all_views(params, turn(goal), turn(current))
         np.testing.assert_allclose(other.start, turn(one.start), atol=1e-4)
-        np.testing.assert_allclose(NET.apply(params, other, moved, method="due"), odds, atol=1e-4)
+        np.testing.assert_allclose(due(params, other, moved), odds, atol=1e-4)
 
 
 def test_the_likeliest_strokes_are_read_between_the_peaks():
@@ -104,9 +111,9 @@ def test_proposals_go_with_the_depth_of_the_blade(params):
 def test_a_scene_that_is_not_dug_is_refused(params):
     policy, goal = Policy(NET, params), np.zeros((1, SIDE, SIDE))
     with pytest.raises(ValueError, match=r"scene\.tool: got NoTool; give make_scene"):
-        policy.propose(make_scene((SIDE, SIDE)), goal, goal)
+        policy.propose(make_scene((SIDE, SIDE), 0.01), goal, goal)
     with pytest.raises(ValueError, match=r"scene\.tool\.depth: got"):
-        policy.propose(make_scene((SIDE, SIDE), tool=Blade(depth=-0.001)), goal, goal)
+        policy.propose(make_scene((SIDE, SIDE), 0.01, tool=Blade(depth=-0.001)), goal, goal)
 
 
 def test_a_policy_comes_back_from_its_file_in_half_precision(params, tmp_path):

@@ -75,7 +75,7 @@ class Hindsight:
 
     def init(self, seed: int) -> Progress:
         maps = jnp.zeros((1, CELLS, CELLS))
-        params = self.net.init(jax.random.key(seed), maps, maps, jnp.zeros((1, 1, 4)))
+        params = jax.jit(self.net.init)(jax.random.key(seed), maps, maps, jnp.zeros((1, 1, 4)))
         return Progress(params, params, _optimiser().init(params), jnp.int32(0), jnp.int32(seed))
 
     def advance(self, state: Progress) -> tuple[Progress, dict[str, float]]:
@@ -169,7 +169,8 @@ def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
     every = due.reshape(batch, 2 * count, 2)
     mixed = jnp.take_along_axis(every, jax.random.randint(a, (batch, 2 * count, 1), 0, 2 * count), 1)
     other = jnp.take_along_axis(due[:, :, 1], jax.random.randint(b, (batch, count, 1), 0, count), 1)
-    moved = due + jax.random.normal(c, due.shape) * 10 ** jax.random.uniform(d, (batch, count, 2, 1), minval=-1, maxval=0.8)
+    far = 10 ** jax.random.uniform(d, (batch, count, 2, 1), due.dtype, -1, 0.8)
+    moved = due + far * jax.random.normal(c, due.shape, due.dtype)
     return jnp.concatenate(
         [
             due.reshape(batch, count, 4),

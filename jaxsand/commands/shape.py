@@ -101,7 +101,9 @@ _BY = {
 def _check_options(options: argparse.Namespace) -> None:
     for option, methods in _BY.items():
         if getattr(options, option) not in (None, False) and options.method not in methods:
-            raise ValueError(f"{option}: has an effect with --method {' or '.join(methods)} only; leave it out")
+            *others, last = methods
+            some = f"{', '.join(others)} or {last}" if others else last
+            raise ValueError(f"{option}: has an effect with --method {some} only; leave it out")
     if options.method == "policy" and options.pushes and not options.refine:
         raise ValueError("pushes: has an effect on the policy with --refine only; add that, or leave it out")
 
