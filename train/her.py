@@ -76,7 +76,12 @@ def relabel(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> S
     """The same steps [T], each with a goal in hindsight, and with the reward and the end that `judge` gives for it.
 
     `ended` stays: the episode did not go on. For a batch of rows use jax.vmap; for more copies, other keys.
+
+    Raises:
+      ValueError: for observations without a goal.
     """
+    if not isinstance(steps.after, dict) or not {"goal", "current"} <= steps.after.keys():
+        raise ValueError("strategy: these observations hold no goal and current; learn without hindsight, by Own()")
     which = strategy.outcome(key, last_steps(steps.ended))
     goal = jax.tree.map(lambda x: x[which], steps.after["current"])
     reward, terminated = jax.vmap(judge)(steps.observation["current"], steps.after["current"], goal)

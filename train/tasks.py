@@ -62,8 +62,8 @@ class Probing:
         return self.probe, None
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """A probe has no goals."""
-        raise ValueError("strategy: a probe has no goals; learn without hindsight, with Own()")
+        """Nothing, since a probe has no goals."""
+        return jnp.zeros(()), jnp.zeros((), bool)
 
     def validate(self, acts: Acts) -> dict[str, float]:
         """Minus the mean regret of the actions that the actor chooses."""
