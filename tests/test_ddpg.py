@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -124,6 +125,19 @@ def test_the_judge_gives_the_environment_s_reward_for_any_goal():
     reward, end = Strokes().judge(seen[0]["current"], seen[1]["current"], seen[0]["goal"])
     assert float(reward) == pytest.approx(far[0] - far[1], rel=1e-4)
     assert not end
+
+
+def test_no_gain_on_sand_exceeds_the_bound_of_values():
+    rng = np.random.default_rng(0)
+    goal, way = rng.normal(size=(8, 8)), rng.normal(size=(9, 8, 8))
+    way[1] = goal  # the best there is
+    seen = {"goal": jnp.asarray(goal)[None], "current": jnp.asarray(way[0])[None]}
+    most = float(Strokes().most(seen)[0])
+    for way_on in (way, way[[0, *[1] * 8]]):
+        gained = [float(Strokes().judge(jnp.asarray(a), jnp.asarray(b), jnp.asarray(goal))[0]) for a, b in pairwise(way_on)]
+        for discount in (0.5, 0.9, 1.0):
+            assert sum(discount**t * r for t, r in enumerate(gained)) <= most + 1e-9
+    assert sum(gained) == pytest.approx(most)
 
 
 @pytest.fixture(scope="module")

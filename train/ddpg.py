@@ -3,10 +3,12 @@
 Deep deterministic policy gradients (Lillicrap et al. 2016, arXiv:1509.02971). With Q' and pi' slow copies of the critic Q
 and the actor pi, and o' what follows observation o, gradient steps make
 
-    (r + discount (1 - terminated) Q'(o', pi'(o')) - Q(o, a))^2   smaller, by the critic,
-    Q(o, pi(o)) - calm |raw(o)|^2 / A                             larger, by the actor, with pi = tanh(raw) in R^A.
+    (r + discount (1 - terminated) min(Q'(o', pi'(o')), most(o')) - Q(o, a))^2   smaller, by the critic,
+    Q(o, pi(o)) - calm |raw(o)|^2 / A                                            larger, by the actor,
 
-A time limit is no end: only `terminated` cuts the values off. Hindsight is in `train.her`.
+with pi = tanh(raw) in R^A. A time limit is no end: only `terminated` cuts the values off. No value exceeds `most`, which the
+task knows: without that bound they run away, as the original implementation of HER clips them for. Hindsight is in
+`train.her`.
 """
 
 import math
@@ -173,6 +175,7 @@ def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, j
     """One update of both networks and their slow copies from steps [B]."""
     next_action, _ = _act(learner, agent.slow_actor, some.after)
     ahead = _value(learner, agent.slow_critic, some.after, next_action)
+    ahead = jnp.minimum(ahead, learner.task.most(some.after))
     target = some.reward + learner.discount * jnp.where(some.terminated, 0, ahead)
 
     def critic_loss(critic: Any) -> jax.Array:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +42,13 @@ class Strokes:
         reward = jnp.sqrt(jnp.sum((goal - before) ** 2)) - jnp.sqrt(jnp.sum((goal - after) ** 2))
         return reward, jnp.zeros((), bool)
 
+    def most(self, observation: Any) -> jax.Array:
+        """An upper bound [B] of every value: with rewards L_t - L_{t+1}, L >= 0 and a discount g <= 1,
+
+        sum_t g^t (L_t - L_{t+1}) = L_0 - (1 - g) sum_t g^t L_{t+1} <= L_0.
+        """
+        return jnp.sqrt(jnp.sum((observation["goal"] - observation["current"]) ** 2, (1, 2)))
+
     def validate(self, acts: Acts) -> dict[str, float]:
         """On goals set apart: the mean share of the l2 distance that is gone, `score`, and how many are `right`."""
         params = _goals(self.count, self.trials, _SET_APART)
@@ -64,6 +72,10 @@ class Probing:
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Nothing, since a probe has no goals."""
         return jnp.zeros(()), jnp.zeros((), bool)
+
+    def most(self, observation: Any) -> jax.Array:
+        """None is needed."""
+        return jnp.full(len(observation), jnp.inf, observation.dtype)
 
     def validate(self, acts: Acts) -> dict[str, float]:
         """Minus the mean regret of the actions that the actor chooses."""
