@@ -7,25 +7,25 @@ wrong; what to do`. Arguments are read before JAX is imported, so that --help an
 import argparse
 import os
 import sys
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from jaxsand.commands import SCHEMES, run_benchmark, run_plan, run_settle, run_shape, run_trench
+from jaxsand.commands.arguments import Parser, count, fail, keep_compiled_programs, neighbours, number, path_name, seed
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
     if options.run is not run_benchmark:  # which tells compile time apart
-        _keep_compiled_programs()
+        keep_compiled_programs()
     try:
         options.run(options)
     except ValueError as error:
-        return _fail(str(error))
+        return fail(str(error))
     except RuntimeError as error:
         if type(error).__name__ != "OutcomeError":
             raise
-        return _fail(f"outcome: {error}")
+        return fail(f"outcome: {error}")
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
@@ -36,8 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="jaxsand", description="Robots that shape sand. Every command answers --help.")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    parser = Parser(prog="jaxsand", description="Robots that shape sand. Every command answers --help.")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     _shape(commands)
     _settle(commands)
     _plan(commands)
@@ -52,41 +52,41 @@ def _shape(commands: Any) -> None:
     p.add_argument("--method", choices=["plan", "optimise", "policy", "search", "strokes"], default="plan", help=_METHODS)
     p.add_argument(
         "--strokes",
-        type=_count,
+        type=count,
         metavar="N",
         help="strokes to use (optimise: as many as pay; search, policy: a glyph's own number, else 6)",
     )
     p.add_argument(
         "--pushes",
-        type=_count,
+        type=count,
         metavar="N",
         help="pushes that may be tried (optimise, policy --refine: 4000; search: 1000 a stroke)",
     )
-    p.add_argument("--lookahead", type=_count, metavar="K", help="policy: try its K likeliest strokes on K best plans")
+    p.add_argument("--lookahead", type=count, metavar="K", help="policy: try its K likeliest strokes on K best plans")
     p.add_argument("--refine", action="store_true", help="policy: improve its plan by gradients")
-    p.add_argument("--seed", type=_seed, metavar="K", help="for the random choices of optimise and search (0)")
+    p.add_argument("--seed", type=seed, metavar="K", help="for the random choices of optimise and search (0)")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
     p.add_argument("--surface", default="level", help="what lies there before: level, terrain or a .npy file (m)")
-    p.add_argument("--relief-mm", type=_number, default=10.0, help="height range of --surface terrain")
-    p.add_argument("--depth-mm", type=_number, help="trench depth (3; 7.5 for .npy and terrain)")
-    p.add_argument("--spacing", type=_number, help="grid spacing in m (0.01)")
-    p.add_argument("--resolution", type=_count, help="grid cells to a map cell (6)")
-    p.add_argument("--cells", type=_count, help="grid cells along the longer side of a .png or terrain (48)")
-    p.add_argument("--out", type=_path, metavar="DIR", help="folder to write to (shape-GOAL)")
+    p.add_argument("--relief-mm", type=number, default=10.0, help="height range of --surface terrain")
+    p.add_argument("--depth-mm", type=number, help="trench depth (3; 7.5 for .npy and terrain)")
+    p.add_argument("--spacing", type=number, help="grid spacing in m (0.01)")
+    p.add_argument("--resolution", type=count, help="grid cells to a map cell (6)")
+    p.add_argument("--cells", type=count, help="grid cells along the longer side of a .png or terrain (48)")
+    p.add_argument("--out", type=path_name, metavar="DIR", help="folder to write to (shape-GOAL)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_shape)
 
 
 def _settle(commands: Any) -> None:
     p = commands.add_parser("settle", help="let a height map settle to its angle of repose")
-    p.add_argument("input", type=_path, metavar="IN.npy", help="height map [H, W] in m")
-    p.add_argument("--out-file", type=_path, required=True, metavar="OUT.npy")
-    p.add_argument("--spacing", type=_number, default=0.01, metavar="M", help="grid spacing in m (0.01)")
-    p.add_argument("--repose-deg", type=_number, default=29.0, help="angle of repose (29)")
-    p.add_argument("--neighbours", type=_neighbours, choices=[4, 8, "isotropic"], default=8, help="4, 8 or isotropic (8)")
+    p.add_argument("input", type=path_name, metavar="IN.npy", help="height map [H, W] in m")
+    p.add_argument("--out-file", type=path_name, required=True, metavar="OUT.npy")
+    p.add_argument("--spacing", type=number, default=0.01, metavar="M", help="grid spacing in m (0.01)")
+    p.add_argument("--repose-deg", type=number, default=29.0, help="angle of repose (29)")
+    p.add_argument("--neighbours", type=neighbours, choices=[4, 8, "isotropic"], default=8, help="4, 8 or isotropic (8)")
     p.add_argument("--scheme", choices=SCHEMES, default="super-time-stepping", help="relaxation: the paper's sweep")
-    p.add_argument("--tol", type=_number, default=1e-3, help="largest slope in excess of repose, a tangent (1e-3)")
-    p.add_argument("--bound", type=_count, default=200_000, help="most sweeps (200000)")
+    p.add_argument("--tol", type=number, default=1e-3, help="largest slope in excess of repose, a tangent (1e-3)")
+    p.add_argument("--bound", type=count, default=200_000, help="most sweeps (200000)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_settle)
 
@@ -96,22 +96,22 @@ def _plan(commands: Any) -> None:
     p.add_argument("map", metavar="MAP.txt", help="rows of # (dig) and ., S marks the start; or a letter")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
     p.add_argument("--end", metavar="R,C", help="cell where the stroke must end (anywhere)")
-    p.add_argument("--turn-cost", type=_number, default=0.0, metavar="C", help="steps that a change of heading costs (0)")
+    p.add_argument("--turn-cost", type=number, default=0.0, metavar="C", help="steps that a change of heading costs (0)")
     p.add_argument("--engine", choices=["auto", "paper", "astar", "exact", "anytime", "frontier"], default="auto")
-    p.add_argument("--weight", type=_number, metavar="W", help="how much astar and paper overrate what is left (1)")
-    p.add_argument("--seconds", type=_number, metavar="S", help="time for anytime (10); with auto, use anytime")
-    p.add_argument("--out", type=_path, metavar="DIR", help="folder for a picture of the path, and the report")
+    p.add_argument("--weight", type=number, metavar="W", help="how much astar and paper overrate what is left (1)")
+    p.add_argument("--seconds", type=number, metavar="S", help="time for anytime (10); with auto, use anytime")
+    p.add_argument("--out", type=path_name, metavar="DIR", help="folder for a picture of the path, and the report")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_plan)
 
 
 def _trench(commands: Any) -> None:
     p = commands.add_parser("trench", help="a wheel's trenches, beside their closed form, their exact relaxation and scans")
-    p.add_argument("--spacing-mm", type=_number, default=2.0, metavar="D", help="grid spacing (2)")
+    p.add_argument("--spacing-mm", type=number, default=2.0, metavar="D", help="grid spacing (2)")
     p.add_argument("--rule", choices=["own", "split"], help="own: the push rule; split: piles as in the closed form (both)")
     columns = "beta_deg, sinkage_mm, scan, x_mm (to the right of the way; the flank that leads is on its left), z_mm"
-    p.add_argument("--measured", type=_path, metavar="CSV", help=f"scans: {columns}")
-    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the profiles, two figures and the report")
+    p.add_argument("--measured", type=path_name, metavar="CSV", help=f"scans: {columns}")
+    p.add_argument("--out", type=path_name, metavar="DIR", help="folder for the profiles, two figures and the report")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_trench)
 
@@ -138,15 +138,17 @@ def _bench(commands: Any) -> None:
         default="all",
     )
     p.add_argument(
-        "--batch", type=_count, metavar="N", help="maps in a batch (4096; env: 1024; grad: 64, if given larger maps as well)"
+        "--batch", type=count, metavar="N", help="maps in a batch (4096; env: 1024; grad: 64, if given larger maps as well)"
     )
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
-    p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of the searches on sand, the first for strokes (0)")
-    p.add_argument("--seeds", type=_count, metavar="N", help="strokes: how many seeds from that one on (1)")
-    p.add_argument("--calls", type=_count, metavar="N", help="strokes: calls of the simulator (4000)")
+    p.add_argument("--seed", type=seed, default=0, metavar="K", help="of the searches on sand, the first for strokes (0)")
+    p.add_argument("--seeds", type=count, metavar="N", help="strokes: how many seeds from that one on (1)")
+    p.add_argument("--calls", type=count, metavar="N", help="strokes: calls of the simulator (4000)")
     p.add_argument("--goals", choices=["letters", "turned", "rough", "eight"], help="strokes: (letters)")
     p.add_argument("--methods", metavar="A,B", help="strokes: methods by name (all)")
-    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the report and its figure; strokes goes on there")
+    p.add_argument(
+        "--out", type=path_name, metavar="DIR", help="folder for the report and its figure; strokes goes on there"
+    )
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_benchmark)
 
@@ -155,67 +157,6 @@ _METHODS = (
     "plan: a shortest path; optimise: strokes by gradients through the sand; policy: what a network learned; "
     "search: strokes tried on real sand; strokes: a glyph's own"
 )
-
-
-class _Parser(argparse.ArgumentParser):
-    """Mistakes become one line `error: field: what; remedy` and exit code 2."""
-
-    def error(self, message: str) -> NoReturn:
-        field, what = "arguments", message
-        if message.startswith("argument "):
-            field, _, what = message.removeprefix("argument ").partition(": ")
-            field = field.split("/")[-1].removeprefix("--")
-        raise SystemExit(_fail(f"{field}: {what}; see {self.prog} --help"))
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"got {text!r}, which is no number") from None
-
-
-def _path(text: str) -> Path:
-    if not text:
-        raise argparse.ArgumentTypeError("got an empty name")
-    return Path(text)
-
-
-def _neighbours(text: str) -> int | str:
-    return int(text) if text.isdecimal() else text
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number of at least 1")
-    return int(text)
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number of at least 0")
-    return int(text)
-
-
-def _fail(message: str) -> int:
-    if sys.stderr.isatty():
-        print("\r\033[K", end="", file=sys.stderr)
-    print("error: " + " ".join(message.split()), file=sys.stderr)
-    return 2
-
-
-def _keep_compiled_programs() -> None:
-    """Lets JAX keep compiled programs in the user's cache, so that a second run starts fast."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsand"
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if not os.access(cache, os.W_OK):
-        return
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 
 if __name__ == "__main__":

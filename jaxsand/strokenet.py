@@ -224,7 +224,8 @@ def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
     begin = jnp.exp(scores.start)
     p, first = _peaks(begin, _STARTS)
     a = jax.vmap(lambda cell: _centre(begin, cell))(first)
-    query = jnp.einsum("pij,ijk->pk", spread(a, begin.shape), scores.query)
+    rows, columns = begin.shape
+    query = jnp.einsum("pij,ijk->pk", spread(a, (rows, columns)), scores.query)
     end = jnp.exp(_log_share(jnp.einsum("pk,ijk->pij", query, scores.key)))
     q, last = jax.vmap(lambda share: _peaks(share, _ENDS))(end)
     b = jax.vmap(lambda share, cells: jax.vmap(lambda cell: _centre(share, cell))(cells))(end, last)

@@ -49,8 +49,11 @@ def same(a, b):
     return all(np.array_equal(x, y) for x, y in zip(plain[:half], plain[half:], strict=True))
 
 
-@pytest.mark.parametrize("backup", [Sampled(), Every()], ids=lambda b: type(b).__name__)
-@pytest.mark.parametrize("question", QUESTIONS, ids=lambda q: type(q).__name__)
+SLOW = pytest.mark.slow  # the other way to targets, which is as long in compiling again
+ASKED = [pytest.param(q, b, marks=() if type(b) is Every else SLOW) for b in (Every(), Sampled()) for q in QUESTIONS]
+
+
+@pytest.mark.parametrize(("question", "backup"), ASKED, ids=lambda x: type(x).__name__)
 def test_a_probe_s_known_values_are_found(question, backup):
     probe = Probe(question, Two())
     learner = Dqn(
@@ -222,7 +225,7 @@ def test_a_chunk_is_a_function_of_the_state_and_may_be_vmapped_over_seeds():
         assert a.ndim < 3 or not np.array_equal(a[0], a[1])
 
 
-@pytest.mark.parametrize("learner", [TINY, replace(TINY, backup=Sampled(), reach=3)], ids=["every", "sampled"])
+@pytest.mark.parametrize("learner", [TINY, pytest.param(replace(TINY, backup=Sampled(), reach=3), marks=SLOW)])
 def test_small_maps_are_learned_and_a_beam_does_no_worse(learner):
     pool = shape_pool(Shapes(), jax.random.key(5), 64, (3, 3), jnp.zeros((0, 3, 3), bool))
     few, state = fewest(pool), learner.init(1)

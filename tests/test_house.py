@@ -61,7 +61,7 @@ INSIDE = {
     "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],
     "optimise": [{"account", "sketch"}, {"moves"}],
     "env": [{"spaces", "episode", "maps", "pushing"}, {"onmap", "multi"}, {"onsand", "library"}],
-    "commands": [{"printing"}, {"shape", "settle", "plan", "trench", "bench"}],
+    "commands": [{"printing", "arguments"}, {"shape", "settle", "plan", "trench", "bench"}],
 }
 HEAVY = {"matplotlib": {"render", "rutfigures", "strokefigures", "goals"}, "PIL": {"render", "goals"}}
 

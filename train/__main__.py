@@ -5,7 +5,7 @@ import math
 import sys
 from typing import Any
 
-from jaxsand.__main__ import _count, _fail, _keep_compiled_programs, _Parser, _path, _seed
+from jaxsand.commands.arguments import Parser, count, fail, keep_compiled_programs, path_name, seed
 from train.commands import MINUTES, SHIPPED, Stopped, run_evaluation, run_shipping, run_training
 
 _STEPS = {
@@ -23,11 +23,11 @@ _ABOUT = {
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
-    _keep_compiled_programs()
+    keep_compiled_programs()
     try:
         options.command(options)
     except ValueError as error:
-        return _fail(str(error))
+        return fail(str(error))
     except (KeyboardInterrupt, Stopped) as error:
         print(str(error) or "stopped", file=sys.stderr)
         return 130
@@ -35,8 +35,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="python -m train", description="Learners that shape sand. Every command answers --help.")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    parser = Parser(prog="python -m train", description="Learners that shape sand. Every command answers --help.")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     for learner in MINUTES:
         _training(commands, learner)
     _evaluation(commands)
@@ -49,9 +49,9 @@ def _training(commands: Any, learner: str) -> None:
     end = p.add_mutually_exclusive_group()
     of_paper = ", or 10,000 episodes with --paper" if learner == "ddpg" else ""
     end.add_argument("--minutes", type=_minutes, metavar="M", help=f"minutes of work ({MINUTES[learner]:g}{of_paper})")
-    end.add_argument("--steps", type=_count, metavar="N", help=_STEPS[learner])
-    p.add_argument("--seed", type=_seed, default=0, metavar="K", help="of everything drawn by chance (0)")
-    p.add_argument("--out", type=_path, metavar="RUN", help=f"folder of the run (runs/{learner}-SEED)")
+    end.add_argument("--steps", type=count, metavar="N", help=_STEPS[learner])
+    p.add_argument("--seed", type=seed, default=0, metavar="K", help="of everything drawn by chance (0)")
+    p.add_argument("--out", type=path_name, metavar="RUN", help=f"folder of the run (runs/{learner}-SEED)")
     p.add_argument("--resume", action="store_true", help="go on with the run there; minutes and steps count from its start")
     p.add_argument("--tensorboard", action="store_true", help="write its metrics for TensorBoard as well")
     p.add_argument("--json", action="store_true", help="print one JSON object")
@@ -64,19 +64,19 @@ def _evaluation(commands: Any) -> None:
     p = commands.add_parser("evaluate", help="how many glyphs, or for dqn letter maps, a run gets right")
     p.add_argument("run", metavar="RUN|pretrained", help="folder of a run, whose best state is used, or what jaxsand ships")
     which = p.add_mutually_exclusive_group()
-    which.add_argument("--glyphs", type=_path, metavar="FILE.json", help="names, each with strokes of the unit square")
+    which.add_argument("--glyphs", type=path_name, metavar="FILE.json", help="names, each with strokes of the unit square")
     which.add_argument("--goals", metavar="NAME", help="a set of goals (letters); a wrong name lists them")
-    p.add_argument("--lookahead", type=_count, metavar="K", help="try its K best actions on K plans, with the simulator")
+    p.add_argument("--lookahead", type=count, metavar="K", help="try its K best actions on K plans, with the simulator")
     p.add_argument("--refine", action="store_true", help="improve its plan by gradients through the simulator")
-    p.add_argument("--out", type=_path, metavar="DIR", help="folder for the report and a picture of goals and results")
+    p.add_argument("--out", type=path_name, metavar="DIR", help="folder for the report and a picture of goals and results")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(command=run_evaluation)
 
 
 def _shipping(commands: Any) -> None:
     p = commands.add_parser("ship", help="make the best policy of a hindsight run the one that jaxsand comes with")
-    p.add_argument("run", type=_path, metavar="RUN", help="folder of the run")
-    p.add_argument("--out-file", type=_path, default=SHIPPED, metavar="FILE.npz", help="another place for it")
+    p.add_argument("run", type=path_name, metavar="RUN", help="folder of the run")
+    p.add_argument("--out-file", type=path_name, default=SHIPPED, metavar="FILE.npz", help="another place for it")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(command=run_shipping)
 

@@ -3,14 +3,14 @@
 python -m train.curves RUN [RUN ...] --out FILE.png
 """
 
-import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxsand.commands.arguments import Parser, fail, path_name
 from jaxsand.files import existing, written
 
 if TYPE_CHECKING:
@@ -55,17 +55,16 @@ def curves_figure(curves: dict[str, dict[str, np.ndarray]]) -> "Figure":
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser: Any = argparse.ArgumentParser(prog="python -m train.curves", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
+    parser = Parser(prog="python -m train.curves", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", type=path_name, nargs="+", metavar="RUN")
+    parser.add_argument("--out", type=path_name, required=True, metavar="FILE.png")
     options = parser.parse_args(arguments)
     try:
         figure = curves_figure({run.name: curve(run) for run in options.runs})
         with written(options.out) as path:
             figure.savefig(path, dpi=110, format="png")
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return fail(str(error))
     return 0
 
 

@@ -7,7 +7,6 @@ polygons 10 to 30 mm deep. The blade here goes as deep as the goal. Their tool i
 not known in every detail, so their figures are a yardstick and this is no race.
 """
 
-import argparse
 import math
 import sys
 import time
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 from matplotlib.path import Path as Outline
 
+from jaxsand.commands.arguments import Parser, count, seed
 from jaxsand.files import as_json, as_table, progress
 from jaxsand.optimise import optimise_strokes
 from jaxsand.policy import load_policy
@@ -43,12 +43,12 @@ class PeerGoal:
     goal: np.ndarray
 
 
-def peer_goals(count: int, seed: int) -> list[PeerGoal]:
+def peer_goals(number: int, key: int) -> list[PeerGoal]:
     """Rectangles, L shapes and polygons in turn, somewhere on the bed."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(key)
     makers = {"rectangle": _rectangle, "L": _corner, "polygon": _polygon}
     out = []
-    for k in range(count):
+    for k in range(number):
         name = list(makers)[k % len(makers)]
         corners = makers[name](rng)
         depth = rng.uniform(0.01, 0.03) if name == "polygon" else rng.uniform(0.005, 0.02)
@@ -77,19 +77,19 @@ def _polygon(rng: np.random.Generator) -> np.ndarray:
     return rng.uniform(0.03, 0.07, 6)[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
 
 
-def methods(pushes: int, seed: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
+def methods(pushes: int, key: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
     """What finds strokes [N, 4] (m), at most twelve, by a cost of about so many pushes."""
     policy = load_policy()
     return {
         "policy, looking ahead": lambda s: plan_by_policy(policy, s, _STROKES, Stages(width=6)).strokes,
         "the same, then gradients": lambda s: plan_by_policy(policy, s, _STROKES, Stages(6, pushes)).strokes,
-        "plan_sand": lambda s: _searched(s, pushes, seed),
-        "optimise_strokes": lambda s: optimise_strokes(s.scene, s.goal, strokes=_STROKES, key=seed, budget=pushes).strokes,
+        "plan_sand": lambda s: _searched(s, pushes, key),
+        "optimise_strokes": lambda s: optimise_strokes(s.scene, s.goal, strokes=_STROKES, key=key, budget=pushes).strokes,
     }
 
 
-def _searched(sand: SandLoss, pushes: int, seed: int) -> np.ndarray:
-    found = plan_sand(sand.scene, sand.start, sand.goal, strokes=_STROKES, budget=pushes, seed=seed)
+def _searched(sand: SandLoss, pushes: int, key: int) -> np.ndarray:
+    found = plan_sand(sand.scene, sand.start, sand.goal, strokes=_STROKES, budget=pushes, seed=key)
     return np.array([np.concatenate([a, b]) for path in found.paths for a, b in pairwise(path)])
 
 
@@ -106,11 +106,11 @@ def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:
     }
 
 
-def compare(count: int, pushes: int, seed: int, tell: Callable[[str], None]) -> list[dict[str, Any]]:
+def compare(number: int, pushes: int, key: int, tell: Callable[[str], None]) -> list[dict[str, Any]]:
     """A row for each method, means over the goals, and the published figures."""
-    goals = peer_goals(count, seed)
+    goals = peer_goals(number, key)
     rows = []
-    for name, find in methods(pushes, seed).items():
+    for name, find in methods(pushes, key).items():
         figures, began = [], time.perf_counter()
         for goal in goals:
             tell(f"{name}: {goal.name}")
@@ -119,22 +119,19 @@ def compare(count: int, pushes: int, seed: int, tell: Callable[[str], None]) -> 
             height = sand.maps(plan[None])[0] if len(plan) else sand.start
             figures.append(judged(goal, height) | {"strokes": float(len(plan))})
         means = {key: float(np.mean([f[key] for f in figures])) for key in figures[0]}
-        rows.append({"method": name, **means, "seconds": (time.perf_counter() - began) / count})
+        rows.append({"method": name, **means, "seconds": (time.perf_counter() - began) / number})
     return [*rows, PUBLISHED]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m train.peer", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--goals", type=int, default=12, metavar="N", help="goals (12)")
+    parser = Parser(prog="python -m train.peer", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--goals", type=count, default=12, metavar="N", help="goals (12)")
     parser.add_argument(
-        "--pushes", type=int, default=4000, metavar="N", help="pushes a goal for searches and gradients (4000)"
+        "--pushes", type=count, default=4000, metavar="N", help="pushes a goal for searches and gradients (4000)"
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="K")
+    parser.add_argument("--seed", type=seed, default=0, metavar="K")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
-    for field in ("goals", "pushes"):
-        if getattr(options, field) < 1:
-            parser.error(f"{field}: got {getattr(options, field)}; give a number of at least 1")
     rows = compare(options.goals, options.pushes, options.seed, progress())
     print(as_json({"rows": rows}) if options.json else "\n".join(as_table(rows, "method")))
     return 0

@@ -30,23 +30,25 @@ class Shapes:
 
     def draw(self, key: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
         """A map [H, W] (bool) and its start [2] (row, column)."""
-        key, begin, many, choose = jax.random.split(key, 4)
-        first = jax.random.randint(begin, (2,), 0, jnp.asarray(shape), jnp.int32)
-        count = jax.random.randint(many, (), _FEWEST, _MOST + 1)
+        size = jnp.asarray(shape, jnp.float32)
+        chance = jax.random.uniform(key, (1 + _MOST, 6), jnp.float32)  # all at once: each draw takes time to compile
+        first = (chance[0, :2] * size).astype(jnp.int32)
+        count = _whole(chance[0, 2], _FEWEST, _MOST)
 
         def one(k: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             dig, end = carry
-            where, which, kind, long, keep, slope = jax.random.split(jax.random.fold_in(key, k), 6)
-            place = jnp.where(jax.random.uniform(which) < self.onward, end, _any_of(where, dig))
-            way = jax.random.randint(kind, (), 0, 4) + 4 * (jax.random.uniform(slope) < self.stairs)
-            new, there = _line(dig, place, way, jax.random.randint(long, (), _SHORTEST, _LONGEST + 1))
-            blocked = (_blocks(new) > _blocks(dig)) & (jax.random.uniform(keep) < self.thin)
+            onward, anywhere, way, stairs, steps, thin = chance[1 + k]
+            place = jnp.where(onward < self.onward, end, _any_of(anywhere, dig))
+            new, there = _line(
+                dig, place, _whole(way, 0, 3) + 4 * (stairs < self.stairs), _whole(steps, _SHORTEST, _LONGEST)
+            )
+            blocked = (_blocks(new) > _blocks(dig)) & (thin < self.thin)
             good = (k < count) & ~blocked
             return jnp.where(good, new, dig), jnp.where(good, there, end)
 
         dig = jnp.zeros(shape, bool).at[first[0], first[1]].set(True)
         dig = lax.fori_loop(0, _MOST, one, (dig, first))[0]
-        return dig, _any_of(choose, dig)
+        return dig, _any_of(chance[0, 3], dig)
 
 
 @partial(jax.jit, static_argnames=("shapes", "count", "shape"))
@@ -70,10 +72,16 @@ def _to_corner(dig: jax.Array) -> jax.Array:
     return jnp.roll(dig, jnp.stack([-up, -left]), (0, 1))
 
 
-def _any_of(key: jax.Array, dig: jax.Array) -> jax.Array:
-    """The row and column of a true cell, each as likely."""
-    odds = jnp.where(dig.ravel(), jnp.float32(0), -jnp.inf)
-    return jnp.stack(jnp.divmod(jax.random.categorical(key, odds), dig.shape[1])).astype(jnp.int32)
+def _whole(chance: jax.Array, low: int, high: int) -> jax.Array:
+    """A whole number from low to high, each as likely, of a chance from 0 to 1."""
+    return low + (chance * (high - low + 1)).astype(jnp.int32)
+
+
+def _any_of(chance: jax.Array, dig: jax.Array) -> jax.Array:
+    """The row and column of a true cell, each as likely, of a chance from 0 to 1."""
+    rank = jnp.cumsum(dig.ravel())
+    which = jnp.argmax(rank > (chance * rank[-1]).astype(rank.dtype))
+    return jnp.stack(jnp.divmod(which, dig.shape[1])).astype(jnp.int32)
 
 
 def _line(dig: jax.Array, place: jax.Array, way: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
