@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsand import goals
-from jaxsand.env.maps import map_pool
+from jaxsand.env.maps import STEPS, map_pool
 from jaxsand.env.onmap import MapParams, OnMap
 from train.backup import Every, Items, Sampled, items_of
 from train.dqn import Dqn, begin, practise
@@ -16,8 +16,9 @@ from train.dqn_tasks import Asking, SingleStroke
 from train.evaluate_maps import beams, evaluate, fewest, walks
 from train.her import Own, Steps
 from train.probes import QUESTIONS, Probe, Two
-from train.qnet import Bins, Greedy, Mean, around, dueling
+from train.qnet import Bins, Greedy, Mean, QNet, around, dueling
 from train.shapes import Shapes, among, shape_pool
+from train.views import VIEWS, Symmetric, turned, turned_steps
 
 KEY = jax.random.key(0)
 TINY = Dqn(
@@ -276,3 +277,28 @@ def test_letters_start_where_their_maps_say():
     report = evaluate(Blind(), zero)
     assert report["total"] == 26
     assert [report["maps"][letter]["fewest"] for letter in "ASTR"] == [23, 27, 18, 25]  # the paper's
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_step_on_a_turned_map_is_the_turned_step(view):
+    for step, there in zip(STEPS, turned_steps(view), strict=True):
+        pose, after = np.zeros((2, 1, 5, 5))
+        pose[0, 2, 1], after[0, 2 + step[0], 1 + step[1]] = 1, 1
+        begin = np.argwhere(np.asarray(turned(pose, view))[0])[0]
+        end = np.argwhere(np.asarray(turned(after, view))[0])[0]
+        np.testing.assert_array_equal(end - begin, STEPS[there])
+
+
+def test_what_looks_at_all_views_values_turned_steps_alike():
+    net = QNet(around, 4, Mean(), 16, 1)
+    dig = np.random.default_rng(0).random((1, 5, 5)) < 0.6
+    planes = {"goal": dig, "current": dig & (np.indices((5, 5)).sum(0) > 4), "pose": np.zeros((1, 5, 5), bool)}
+    planes["pose"][0, 1, 3] = True
+    params = net.init(KEY, planes)
+    policy = Symmetric(net, jax.tree.map(lambda p: p + 0.1, params))
+    values = policy.values(planes)
+    for view in VIEWS:
+        there = policy.values({name: turned(plane, view) for name, plane in planes.items()})
+        np.testing.assert_allclose(there[:, turned_steps(view)], values, atol=1e-5)
+    alone = Greedy(net, policy.params)
+    assert not np.allclose(alone.values({n: turned(p, 1) for n, p in planes.items()})[:, turned_steps(1)], values, atol=1e-3)

@@ -95,9 +95,13 @@ class Dqn:
         """What greedy walks reach on goals set apart; see the task."""
         return self.task.validate(self.policy(state))
 
-    def policy(self, state: Walking) -> Greedy:
-        """What acts."""
+    def walker(self, state: Walking) -> Greedy:
+        """What acts while it learns."""
         return Greedy(self.net, state.average)
+
+    def policy(self, state: Walking) -> Greedy:
+        """What acts when it is judged; see the task."""
+        return self.task.policy(self.walker(state))
 
     def ring(self) -> Buffer:
         """What remembers."""
@@ -138,7 +142,7 @@ def _optimiser() -> optax.GradientTransformation:
 def _walk(learner: Dqn, state: Walking, params: Any, key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
     """The environments' last observations and states [E, ...], and their steps [T, E, ...]."""
     task: Any = learner.task
-    number, policy = learner.envs, learner.policy(state)
+    number, policy = learner.envs, learner.walker(state)
     share = learner.careful ** jnp.linspace(1 / 8, 1, number)
 
     def one(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Steps]:

@@ -17,6 +17,7 @@ from train.evaluate_maps import fewest, walks
 from train.probes import Probe, ProbeState, Two
 from train.qnet import Greedy, around, flat
 from train.shapes import Shapes, among, shape_pool
+from train.views import Symmetric
 
 Look = Callable[[Any], jax.Array]
 _SET_APART, _TRIALS = 1_000_003, 256  # the seed, and the number, of maps that it is validated on
@@ -72,6 +73,11 @@ class SingleStroke:
         """Which observations [B, ...] have a goal that is never to be learned from [B]."""
         return among(observations["goal"], jnp.asarray(_barred(self)))
 
+    def policy(self, own: Greedy) -> Greedy:
+        """What is judged: on square maps, the mean of all views."""
+        rows, columns = self.env.shape
+        return Symmetric(own.net, own.params) if rows == columns else own
+
     def validate(self, policy: Greedy) -> dict[str, float]:
         """On random maps set apart: the share `solved`, the share solved in the fewest steps (`optimal`), and the mean of
         fewest steps / steps, 0 for a map that is not solved (`score`)."""
@@ -124,6 +130,10 @@ class Asking:
     def barred(self, observations: jax.Array) -> jax.Array:
         """None is [B]."""
         return jnp.zeros(len(observations), bool)
+
+    def policy(self, own: Greedy) -> Greedy:
+        """What is judged."""
+        return own
 
     def validate(self, policy: Greedy) -> dict[str, float]:
         """Minus the mean regret of the actions that the policy chooses."""
