@@ -22,7 +22,8 @@ from jaxsand.window import Whole
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]
-_VMAP = "vmap"
+_FULL, _FAST, _MAP, _SAND = KINDS = "full push", "fast push", "walk on a map", "walk on sand"
+_VMAP, _LOOP = "vmap", "Gymnasium, one by one"
 _ROUNDS = 3
 _STEPS = 3  # of a batch to a round
 _ALONE = 32  # steps to a round of what makes them one by one
@@ -40,42 +41,40 @@ class Contender:
     call: Callable[[], Any]
 
 
-def bench_env(batch: int = 1024, tell: Tell = lambda _: None) -> list[Row]:
+def bench_env(batch: int = 1024, tell: Tell = lambda _: None, kinds: tuple[str, ...] = KINDS) -> list[Row]:
     """Steps a second of each way, the best of a few rounds in turns, and how many times those of Gymnasium's single
     environment of its kind that is. Compile time is the first call less a later one; `reset_us` what a reset costs in a
     batch (microseconds)."""
-    goals = LevelGoals(jnp.zeros((1, 32, 32), jnp.float32))
-    full = make("multi-stroke", goals=goals)
-    scene = replace(full[1].scene, window=Whole())
-    whole = full[0], replace(full[1], scene=scene)
-    together = replace(full[0], batching=Together()), full[1]
-    fast = make("multi-stroke", goals=goals, push=SwathPush())
-    walks = pool_of(Walks(), jax.random.key(0), 256)
-    on_map = make("single-stroke", goals=walks)
-    on_sand = make("single-stroke", on=OnSand(), goals=walks)
-    ways = [
-        _vmapped("full push", _VMAP, full, batch),
-        _vmapped("full push", "on the whole map", whole, batch),
-        _vmapped("full push", "not sorted by length", together, batch),
-        _without("full push", scene, batch),
-        _vmapped("fast push", _VMAP, fast, batch),
-        _vmapped("walk on a map", _VMAP, on_map, batch),
-        _vmapped("walk on sand", _VMAP, on_sand, max(1, batch // _SHARE)),
-        _gymnasium("full push", "MultiStrokeEnv", {"goals": goals}),
-        _gymnasium("fast push", "MultiStrokeEnv", {"goals": goals, "push": SwathPush()}),
-        _gymnasium("walk on a map", "SingleStrokeEnv", {"goals": walks}),
-        _gymnasium("walk on sand", "SingleStrokeEnv", {"goals": walks, "on": OnSand()}),
-    ]
-    rows = _raced([way for way in ways if way is not None], tell)
-    resets = {"full push": full, "walk on a map": on_map, "walk on sand": on_sand}
-    alone = {row["kind"]: row["steps_per_second"] for row in rows if row["batch"] == 1}
+    ways, made = [], {}
+    for kind in kinds:
+        made[kind], options = _made(kind)
+        many = max(1, batch // _SHARE) if kind == _SAND else batch
+        ways.append(_vmapped(kind, _VMAP, made[kind], many))
+        if kind == _FULL:
+            env, params = made[kind]
+            scene = replace(params.scene, window=Whole())
+            ways.append(_vmapped(kind, "on the whole map", (env, replace(params, scene=scene)), batch))
+            ways.append(_vmapped(kind, "not sorted by length", (replace(env, batching=Together()), params), batch))
+            ways.append(_without(kind, scene, batch))
+        ways += _gymnasium(kind, options)
+    rows = _raced(ways, tell)
+    alone = {row["kind"]: row["steps_per_second"] for row in rows if row["name"] == _LOOP}
     for row in rows:
         if row["kind"] in alone:
             row["times_gymnasium"] = row["steps_per_second"] / alone[row["kind"]]
-        if row["kind"] in resets and row["name"] == _VMAP:
-            tell(f"resets: {row['kind']}")
-            row["reset_us"] = 1e6 * _reset_seconds(*resets[row["kind"]], batch)
+        if row["name"] == _VMAP:
+            row["reset_us"] = 1e6 * _reset_seconds(*made[row["kind"]], batch)
     return rows
+
+
+def _made(kind: str) -> tuple[tuple[Any, Any], dict[str, Any]]:
+    """The environment of a kind with its parameters, and the options that make it."""
+    level = LevelGoals(jnp.zeros((1, 32, 32), jnp.float32))
+    if kind in (_FULL, _FAST):
+        options: dict[str, Any] = {"goals": level} | ({"push": SwathPush()} if kind == _FAST else {})
+        return make("multi-stroke", **options), options
+    options = {"goals": pool_of(Walks(), jax.random.key(0), 256)} | ({"on": OnSand()} if kind == _SAND else {})
+    return make("single-stroke", **options), options
 
 
 def _vmapped(kind: str, name: str, made: tuple[Any, Any], batch: int) -> Contender:
@@ -104,13 +103,13 @@ def _without(kind: str, scene: Any, batch: int) -> Contender:
     return Contender(kind, "no environment", batch, batch, lambda: pushed(scene, level, strokes))
 
 
-def _gymnasium(kind: str, name: str, options: dict[str, Any]) -> Contender | None:
-    """A single environment, step by step, as an agent's loop has it; None without Gymnasium."""
+def _gymnasium(kind: str, options: dict[str, Any]) -> list[Contender]:
+    """A single environment, step by step, as an agent's loop has it; nothing without Gymnasium."""
     try:
-        from jaxsand import gym
+        from jaxsand.gym import MultiStrokeEnv, SingleStrokeEnv
     except ImportError:
-        return None
-    env = getattr(gym, name)(**options)
+        return []
+    env = (MultiStrokeEnv if kind in (_FULL, _FAST) else SingleStrokeEnv)(**options)
     env.action_space.seed(0)
     env.reset(seed=0)
 
@@ -120,7 +119,7 @@ def _gymnasium(kind: str, name: str, options: dict[str, Any]) -> Contender | Non
             if terminated or truncated:
                 env.reset()
 
-    return Contender(kind, "Gymnasium, one by one", 1, _ALONE, loop)
+    return [Contender(kind, _LOOP, 1, _ALONE, loop)]
 
 
 def _raced(ways: list[Contender], tell: Tell) -> list[Row]:

@@ -178,7 +178,7 @@ def test_random_walks_are_maps_of_one_piece():
     straight = envs.pool_of(envs.Walks(4, 4, 1.0), KEY, 64, (9, 9))
     spans = [np.ptp(np.argwhere(dig), axis=0) for dig in np.asarray(straight.dig)]
     turning = envs.pool_of(envs.Walks(4, 4, 0.0), KEY, 64, (9, 9))
-    assert np.mean([min(span) == 0 for span in spans]) > 0.5  # but where the edge turns them
+    assert all(min(span) == 0 for span in spans)
     assert not any(min(np.ptp(np.argwhere(dig), axis=0)) == 0 for dig in np.asarray(turning.dig))
 
 
@@ -231,16 +231,17 @@ def test_a_push_that_is_not_finite_leaves_the_map():
 
 
 def test_rough_starts_are_at_rest_and_their_goals_are_made_from_them():
-    env, params = small(starts=envs.Rough(0.05, 2.0))
+    env, params = small(starts=envs.Rough(0.03, 2.0))
     keys = jax.random.split(KEY, 8)
     _, states = jax.vmap(env.reset, (0, None))(keys, params)
     assert len(np.unique(np.asarray(states.height).reshape(8, -1), axis=0)) == 2
     for height in np.asarray(params.goals.starts):
         assert float(steepest_slope(SMALL, height)) < MU + 2e-3
         assert np.ptp(height) > 0.005
-    changed = np.abs(np.asarray(params.goals.goals) - np.asarray(params.goals.starts)) > 1e-3
-    assert (changed.mean((1, 2)) < 0.7).all()
-    assert changed.any((1, 2)).all()
+    goals_, starts = (np.asarray(x) for x in (params.goals.goals, params.goals.starts))
+    changed = np.abs(goals_[:, None] - starts[None]).sum((2, 3))
+    assert (changed.argmin(1) == [0, 1]).all()
+    assert (changed.min(1) > 0.1).all()
 
 
 def test_the_angle_of_repose_may_differ_from_one_environment_to_the_next():

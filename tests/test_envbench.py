@@ -1,22 +1,21 @@
 """The bench of the environments, at a small size."""
 
+import pytest
+
 from jaxsand.benchmark import table
-from jaxsand.envbench import bench_env
+from jaxsand.envbench import KINDS, bench_env
 
 
-def test_every_way_has_a_rate_and_is_set_against_gymnasium():
-    rows = bench_env(4)
-    kinds = {"full push", "fast push", "walk on a map", "walk on sand"}
-    assert {row["kind"] for row in rows} == kinds
+@pytest.mark.parametrize("kinds", [("fast push", "walk on a map"), pytest.param(KINDS, marks=pytest.mark.slow)])
+def test_every_way_has_a_rate_and_is_set_against_gymnasium(kinds):
+    rows = bench_env(8, kinds=kinds)
+    assert [row["kind"] for row in rows if row["name"] == "vmap"] == list(kinds)
     for row in rows:
         assert row["steps_per_second"] > 0
         assert row["compile_seconds"] >= 0
         assert row["times_gymnasium"] > 0
-        assert (row["times_gymnasium"] == 1) == (row["batch"] == 1)
-    for kind in kinds:
-        assert sum(row["batch"] == 1 for row in rows if row["kind"] == kind) == 1
-    resets = [row["reset_us"] for row in rows if "reset_us" in row]
-    assert len(resets) == 3
-    assert min(resets) > 0
-    shown = table({"machine": "", "batch": 4, "env": rows}).splitlines()
-    assert any(line.startswith("walk on sand Gymnasium, one by one") for line in shown)
+        assert (row["times_gymnasium"] == 1) == (row["name"] == "Gymnasium, one by one")
+        assert (row.get("reset_us", 0) > 0) == (row["name"] == "vmap")
+    assert len(rows) == 2 * len(kinds) + 3 * ("full push" in kinds)
+    shown = table({"machine": "", "batch": 8, "env": rows}).splitlines()
+    assert any(line.startswith("walk on a map Gymnasium, one by one") for line in shown)

@@ -72,10 +72,13 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
     `step` begins a new episode where one ended: the observation is then the new one's, and info["final_observation"] the
     last of the old one; `step_env` does not. All of it works on one environment: use jax.vmap, over params too.
 
-    "single-stroke": `on` an `OnMap()` (a binary map, the default) or an `OnSand()` (the simulator). "multi-stroke": the
-    fields of `MultiStroke`, where goals come from (`goals`: `RandomStrokes()`, glyphs {name: strokes}, or maps [G, H, W] in
-    m), where they start (`starts`: `Level()` or `Rough(relief)`), and a `seed` for both. Every field of the params may be
-    given.
+    "single-stroke": `on` is an `OnMap()` (a binary map, the default) or an `OnSand()` (the simulator); the rest are fields
+    of the params: `goals` a `Walks()` or a pool of maps (`map_pool`, `pool_of`), `step_cost`, `limit`, on sand the `scene`.
+
+    "multi-stroke": the fields of `MultiStroke`; `goals` a `RandomStrokes()`, glyphs {name: strokes of the unit square}, or
+    maps [G, H, W] (m), such as `task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no
+    berms); `starts` a `Level()` or `Rough(relief)`; a `seed` for both; `scene` and `limit`. The default scene is the
+    glyphs', and computes a window of 16 x 16 cells around the blade while it is down.
 
     Raises:
       ValueError: for a name or an option that there is not.
