@@ -75,7 +75,7 @@ def _sorted(way: ByLength, push: Push, stop: Stop | None) -> Pushing:
         filled = jnp.concatenate([order, jnp.repeat(order[-1:], chunk * chunks - size)]).reshape(chunks, chunk)
 
         def pushed(who: jax.Array) -> tuple[jax.Array, jax.Array]:
-            some = [leaf[who] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)]
+            some = [jnp.asarray(leaf)[who] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)]
             axes = jax.tree.unflatten(tree, [0 if m else None for m in mapped])
             return jax.vmap(alone, in_axes=axes)(*jax.tree.unflatten(tree, some))
 
