@@ -71,12 +71,12 @@ def test_a_probe_s_known_values_are_found(question, backup):
         updates=60,
         batch=64,
         capacity=512,
-        rate=3e-3,
+        rate=1e-2,
         memory=0.9,
         careful=0.1,
     )
     state = learner.init(0)
-    for _ in range(8):
+    for _ in range(32):
         state, _ = learner.advance(state)
     assert learner.validate(state)["score"] == 0
     for place in probe.states():
@@ -228,10 +228,11 @@ def test_a_chunk_is_a_function_of_the_state_and_may_be_vmapped_over_seeds():
 
 @pytest.mark.parametrize("learner", [TINY, pytest.param(replace(TINY, backup=Sampled(), reach=3), marks=SLOW)])
 def test_small_maps_are_learned_and_a_beam_does_no_worse(learner):
+    learner = replace(learner, rate=1e-2)
     pool = shape_pool(Shapes(), jax.random.key(5), 64, (3, 3), jnp.zeros((0, 3, 3), bool))
     few, state = fewest(pool), learner.init(1)
     before = np.mean(walks(learner.policy(state), pool) == few)
-    for _ in range(24):
+    for _ in range(160):
         state, _ = learner.advance(state)
     after = walks(learner.policy(state), pool)
     assert before < 0.7

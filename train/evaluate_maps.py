@@ -112,7 +112,7 @@ def _beams(policy: Greedy, pool: MapPool, width: int) -> jax.Array:
     cells = np.stack(np.unravel_index(np.arange(shape[0] * shape[1]), shape), axis=-1)
     there = cells[:, None] + STEPS[None]
     on_map = ((there >= 0) & (there < np.array(shape))).all(-1)
-    to = jnp.asarray(np.where(on_map, there[..., 0] * shape[1] + there[..., 1], 0))  # cell [C], step [4] -> cell
+    to = jnp.asarray(np.where(on_map, there[..., 0] * shape[1] + there[..., 1], 0), jnp.int32)  # cell [C], step [4] -> cell
     on = jnp.asarray(on_map)
 
     def value(dig: jax.Array, dug: jax.Array, place: jax.Array) -> jax.Array:
