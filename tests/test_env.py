@@ -11,7 +11,7 @@ import pytest
 import jaxsand as js
 from jaxsand import env as envs
 from jaxsand import goals, task
-from jaxsand.env.pushing import ByLength, Together
+from jaxsand.env.pushing import ByLength, Together, sorted_by_length
 from jaxsand.settling import steepest_slope
 
 from .conftest import MU
@@ -263,16 +263,20 @@ def test_the_angle_of_repose_may_differ_from_one_environment_to_the_next():
 
 @pytest.mark.parametrize(("size", "chunk", "parts"), [(7, 2, 2), (1, 4, 3), (5, 8, 1)])
 def test_sorting_a_batch_changes_no_map(size, chunk, parts):
+    """Whatever is numpy's and whatever is batched; the angles test does it with a real push."""
+
+    def push(scene, height, stroke):
+        return height * stroke[0] + scene["angle"], stroke[2:].astype(int).sum()
+
     rng = np.random.default_rng(0)
-    strokes = rng.uniform(0, 0.16, (size, 4)).astype(np.float32)
-    maps = rng.uniform(-1e-3, 1e-3, (size, 16, 16)).astype(np.float32)
-    one, together = (way.pushing(QUICK, None) for way in (ByLength(chunk, parts), Together()))
-    many = jax.vmap(one, (None, 0, 0))(SMALL, maps, strokes)
-    expected = jax.vmap(together, (None, 0, 0))(SMALL, maps, strokes)
-    chex.assert_trees_all_close(many, expected, atol=1e-7)
-    seeds = jax.vmap(jax.vmap(one, (None, 0, None)), (None, None, 0))(SMALL, maps, strokes[:2])
-    assert seeds[0].shape == (min(size, 2), size, 16, 16)
-    assert np.abs(np.asarray(seeds[0][0, 0]) - np.asarray(expected[0][0])).max() < 1e-7
+    strokes, maps, angles = rng.uniform(0, 9, (size, 4)), rng.uniform(size=(size, 3, 2)), rng.uniform(size=size)
+    sorted_ = sorted_by_length(ByLength(chunk, parts), push)
+    for scenes, axes in (({"angle": angles}, (0, 0, 0)), ({"angle": 0.5}, (None, 0, 0)), ({"angle": 0.5}, (None, 0, None))):
+        inputs = scenes, maps, strokes if axes[2] == 0 else jnp.asarray(strokes[0])
+        chex.assert_trees_all_close(jax.vmap(sorted_, axes)(*inputs), jax.vmap(push, axes)(*inputs))
+    seeds = jax.vmap(jax.vmap(sorted_, (None, 0, None)), (None, None, 0))({"angle": 0.5}, maps, strokes)
+    expected = jax.vmap(jax.vmap(push, (None, 0, None)), (None, None, 0))({"angle": 0.5}, maps, strokes)
+    chex.assert_trees_all_close(seeds, expected)
 
 
 def test_only_what_is_dug_counts_for_drawn_goals():

@@ -43,7 +43,7 @@ class ByLength:
     parts: int = 2
 
     def pushing(self, push: Push, stop: Stop | None) -> Pushing:
-        return _sorted(self, push, stop)
+        return sorted_by_length(self, _alone(push, stop))
 
 
 Batching = Together | ByLength
@@ -59,8 +59,8 @@ def _alone(push: Push, stop: Stop | None) -> Pushing:
 
 
 @cache
-def _sorted(way: ByLength, push: Push, stop: Stop | None) -> Pushing:
-    alone = _alone(push, stop)
+def sorted_by_length(way: ByLength, alone: Pushing) -> Pushing:
+    """A push that vmap batches that way."""
     one = custom_vmap(alone)
 
     @one.def_vmap
