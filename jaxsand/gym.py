@@ -41,9 +41,7 @@ class _Sand(gymnasium.Env):
     task: ClassVar[str]
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode: got {render_mode!r}; give rgb_array or None")
-        self.render_mode = render_mode
+        self.render_mode = _renders(render_mode)
         self.core, self.params = make(self.task, **options)
         self.observation_space, self.action_space = _spaces(self.core, self.params)
         self.state: Any = None
@@ -125,9 +123,7 @@ class SandVectorEnv(VectorEnv):
     metadata: dict[str, Any] = _Sand.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, task: str, num_envs: int, render_mode: str | None = None, **options: Any) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode: got {render_mode!r}; give rgb_array or None")
-        self.num_envs, self.render_mode = num_envs, render_mode
+        self.num_envs, self.render_mode = num_envs, _renders(render_mode)
         self.core, self.params = make(task, **options)
         self.single_observation_space, self.single_action_space = _spaces(self.core, self.params)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -186,6 +182,13 @@ def picture(core: Any, shown: Obs) -> np.ndarray:
         whole = np.flipud(whole)
     scale = max(1, _PIXELS // rows)
     return np.repeat(np.repeat(whole, scale, 0), scale, 1).round().astype(np.uint8)
+
+
+def _renders(mode: str | None) -> str | None:
+    """The mode, if there is such a one."""
+    if mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode: got {mode!r}; give rgb_array or None")
+    return mode
 
 
 def _coloured(height: np.ndarray) -> np.ndarray:

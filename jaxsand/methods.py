@@ -1,14 +1,15 @@
 """Strokes for a goal by what tries them on the sand: a search, gradients, or the policy that comes with jaxsand."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from jaxsand.optimise import optimise_strokes
+from jaxsand.optimise import Optimised, optimise_strokes
 from jaxsand.policy import load_policy
-from jaxsand.sandplan import plan_sand
+from jaxsand.sandplan import SandPlan, plan_sand
 from jaxsand.shaping import Target, Tell, at_rest
-from jaxsand.stages import Stages, plan_by_policy
+from jaxsand.stages import Planned, Stages, plan_by_policy
 from jaxsand.strokeloss import SandLoss
 
 
@@ -20,7 +21,7 @@ def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: in
     start = at_rest(target.scene, before, tell)
     tell(f"searching {strokes} strokes in about {pushes} pushes")
     found = plan_sand(target.scene, start, target.goal, strokes=strokes, budget=pushes, seed=seed)
-    return replace(target, method="search", paths=found.paths, optimal=None, lower_bound=None, found=found)
+    return _by("search", target, found, found.paths)
 
 
 def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:
@@ -28,13 +29,16 @@ def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pu
     start = at_rest(target.scene, before, tell)
     tell("sketching")
     found = optimise_strokes(target.scene, target.goal, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)
-    paths = tuple(stroke.reshape(2, 2) for stroke in found.strokes)
-    return replace(target, method="optimise", paths=paths, optimal=None, lower_bound=None, found=found)
+    return _by("optimise", target, found, found.strokes.reshape(-1, 2, 2))
 
 
 def by_policy(target: Target, before: np.ndarray | None, strokes: int, stages: Stages, tell: Tell) -> Target:
     """The same goal, by at most so many strokes of the policy, and of the stages that follow it."""
     sand = SandLoss(target.scene, at_rest(target.scene, before, tell), target.goal.astype(np.float32))
     found = plan_by_policy(load_policy(), sand, strokes, stages, tell)
-    paths = tuple(stroke.reshape(2, 2) for stroke in found.strokes)
-    return replace(target, method="policy", paths=paths, optimal=None, lower_bound=None, found=found)
+    return _by("policy", target, found, found.strokes.reshape(-1, 2, 2))
+
+
+def _by(method: str, target: Target, found: SandPlan | Optimised | Planned, paths: Iterable[np.ndarray]) -> Target:
+    """The same goal by what was found."""
+    return replace(target, method=method, paths=tuple(paths), optimal=None, lower_bound=None, found=found)

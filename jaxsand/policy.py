@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from jaxsand.scene import Scene
-from jaxsand.strokenet import Scores, StrokeNet, likeliest, symmetric
-from jaxsand.tool import Blade
+from jaxsand.scene import Scene, blade_of
+from jaxsand.strokenet import StrokeNet, judge, likeliest, symmetric
 
 SIDE = 32
 """Cells along a side of what the network looks at; it learned on such maps."""
@@ -50,7 +49,7 @@ class Policy:
         found, scores = [], []
         for row, column in _looks(scene.grid.shape):
             a, b = (_part(x, row, column) for x in (goal, current))
-            strokes, score = self._of_parts(a, b, count)
+            strokes, score = in_batches(partial(_read, self.net, self.params, count), a, b, _SIZES)
             share = ((a - b) ** 2).sum((1, 2)) / np.maximum(undone, 1e-30)
             found.append(strokes + np.array([column, row, column, row], np.float32))
             scores.append(score + np.log(np.maximum(share, 1e-30))[:, None])
@@ -60,27 +59,30 @@ class Policy:
         strokes = np.clip(np.take_along_axis(strokes, order[..., None], 1), 0.5, np.maximum(most, 0.5))
         return strokes * dx, np.take_along_axis(score, order, 1)
 
-    def _of_parts(self, goal: np.ndarray, current: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        out, first = [], 0
-        while first < len(goal):
-            left = len(goal) - first
-            size = next((n for n in _SIZES if n >= left), _SIZES[-1])
-            some = slice(first, first + size)
-            pad = [(0, max(0, size - left)), (0, 0), (0, 0)]
-            got = _read(self.net, self.params, np.pad(goal[some], pad), np.pad(current[some], pad), count)
-            out.append([np.asarray(x)[:left] for x in got])
-            first += size
-        strokes, scores = (np.concatenate(x) for x in zip(*out, strict=True))
-        return strokes, scores
+
+def in_batches(
+    read: Callable[[np.ndarray, np.ndarray], tuple[jax.Array, ...]],
+    goal: np.ndarray,
+    current: np.ndarray,
+    sizes: Sequence[int],
+) -> tuple[np.ndarray, ...]:
+    """What `read` makes of maps [B, ...], in batches of a few `sizes`, filled up with level sand: few programs serve any
+    number."""
+    out, first = [], 0
+    while first < len(goal):
+        left = len(goal) - first
+        size = next((n for n in sizes if n >= left), sizes[-1])
+        some = slice(first, first + size)
+        pad = [(0, max(0, size - left)), (0, 0), (0, 0)]
+        got = read(np.pad(goal[some], pad), np.pad(current[some], pad))
+        out.append([np.asarray(x)[:left] for x in got])
+        first += size
+    return tuple(np.concatenate(parts) for parts in zip(*out, strict=True))
 
 
 @partial(jax.jit, static_argnames=("net", "count"))
-def _read(net: StrokeNet, params: Any, goal: jax.Array, current: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    def due(scores: Scores, strokes: jax.Array) -> jax.Array:
-        odds: Any = net.apply(params, scores, strokes, method="due")
-        return odds
-
-    return likeliest(due, symmetric(net, params, goal, current), count)
+def _read(net: StrokeNet, params: Any, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return likeliest(judge(net, params), symmetric(net, params, goal, current), count)
 
 
 def save_policy(policy: Policy, path: Path, **about: Any) -> None:
@@ -128,9 +130,7 @@ def _loaded(path: Path) -> Policy:
 
 
 def _depth(scene: Scene) -> float:
-    if not isinstance(scene.tool, Blade):
-        raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
-    depth = float(scene.tool.depth)
+    depth = float(blade_of(scene).depth)
     if not depth > 0:
         raise ValueError(f"scene.tool.depth: got {depth}; the policy needs a blade that digs, such as Blade(depth=0.0075)")
     return depth

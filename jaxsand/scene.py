@@ -72,6 +72,17 @@ def make_scene(
     return scene
 
 
+def blade_of(scene: Scene) -> Blade:
+    """The scene's blade.
+
+    Raises:
+      ValueError: if its tool is none.
+    """
+    if not isinstance(scene.tool, Blade):
+        raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
+    return scene.tool
+
+
 def volume(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     """Volume of the sand above height 0 (m^3): dx^2 times the sum over the cells that are not solid. Differentiable.
 

@@ -95,7 +95,7 @@ def run_all(
 
 def run_one(method: Method, goal: StrokeGoal, budgets: tuple[int, ...], seed: int) -> Row:
     """One search: at each budget its best plan so far, that plan's l2 reduction and IoU; and the curve of all of them."""
-    loss = SandLoss(goal.scene, goal.start, goal.goal)
+    loss = goal.sand
     began = time.perf_counter()
     found = method(loss, len(goal.strokes), loss.bounds, max(budgets), seed)
     seconds = time.perf_counter() - began
@@ -177,7 +177,7 @@ def found(goals: str, rows: list[Row]) -> list[tuple[str, float, np.ndarray, np.
     for goal in GOALS[goals]():
         if goal.name in mine and mine[goal.name]["at"][-1]["plan"] is not None:
             plan = np.array(mine[goal.name]["at"][-1]["plan"])
-            after = SandLoss(goal.scene, goal.start, goal.goal).maps(plan[None])[0]
+            after = goal.sand.maps(plan[None])[0]
             out.append((goal.name, goal.iou(after), goal.goal - goal.start, after - goal.start))
     return out
 

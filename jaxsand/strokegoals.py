@@ -12,9 +12,16 @@ from jaxsand.scene import Scene, make_scene
 from jaxsand.settling import settle
 from jaxsand.shaping import terrain_surface
 from jaxsand.sim import check, rollout
+from jaxsand.strokeloss import SandLoss
 from jaxsand.tool import Blade
 
-_CELLS, _SPACING = 32, 0.01
+CELLS, SPACING = 32, 0.01
+"""Cells along a side of the map that glyphs are judged on, and their size (m)."""
+
+
+def usual_scene() -> Scene:
+    """32 x 32 cells of 0.01 m, 29 degrees, the default blade: the scene in which glyphs are judged."""
+    return make_scene((CELLS, CELLS), SPACING, tool=Blade())
 
 
 @dataclass(frozen=True)
@@ -27,17 +34,26 @@ class StrokeGoal:
     goal: np.ndarray
     strokes: np.ndarray
 
+    @property
+    def sand(self) -> SandLoss:
+        """How far plans end from the goal."""
+        return SandLoss(self.scene, self.start, self.goal)
+
+    @property
+    def depth(self) -> float:
+        """How deep the blade goes (m); 0 without one."""
+        tool = self.scene.tool
+        return float(tool.depth) if isinstance(tool, Blade) else 0.0
+
     def iou(self, after: np.ndarray) -> float:
         """Of what is dug below the start."""
-        tool = self.scene.tool
-        depth = float(tool.depth) if isinstance(tool, Blade) else 0.0
-        return float(task.iou(self.goal - self.start, after - self.start, depth))
+        return float(task.iou(self.goal - self.start, after - self.start, self.depth))
 
 
 def stroke_goal(name: str, strokes: np.ndarray, start: np.ndarray | None = None, scene: Scene | None = None) -> StrokeGoal:
     """The goal that strokes (m) leave on a map at rest (level if None), of 32 x 32 cells of 0.01 m, by the default blade, or
     of another scene."""
-    scene = make_scene((_CELLS, _CELLS), _SPACING, tool=Blade()) if scene is None else scene
+    scene = usual_scene() if scene is None else scene
     start = np.zeros(scene.grid.shape, np.float32) if start is None else np.asarray(start, np.float32)
     shaped = rollout(scene, start, np.asarray(strokes, np.float32))
     check(shaped)
@@ -63,7 +79,7 @@ def turned_letters(names: str = string.ascii_uppercase, degrees: float = 30.0) -
 
 def letters_on_rough_sand(names: str = string.ascii_uppercase, relief: float = 0.01) -> list[StrokeGoal]:
     """Letters pushed into terrain of a height range `relief` (m)."""
-    scene = make_scene((_CELLS, _CELLS), _SPACING)
+    scene = make_scene((CELLS, CELLS), SPACING)
     rested = settle(scene, terrain_surface(scene.grid.shape, relief).astype(np.float32), stop=UntilStill(bound=200_000))
     check(rested)
     rough = np.asarray(rested.height)

@@ -177,25 +177,41 @@ def ends(scores: Scores, starts: jax.Array) -> jax.Array:
     return _log_share(jnp.einsum("brk,bijk->brij", query, scores.key))
 
 
+def turned(maps: jax.Array, way: int, rows: int = 1) -> jax.Array:
+    """Square maps, with `rows` the axis of their rows, before that of their columns, in one of eight ways: bit 1 turns rows
+    round and bit 2 columns, then bit 0 swaps them."""
+    maps = jnp.flip(maps, [axis + rows - 1 for axis in (1, 2) if way >> axis & 1])
+    return maps.swapaxes(rows, rows + 1) if way & 1 else maps
+
+
+def turned_back(maps: jax.Array, way: int, rows: int = 1) -> jax.Array:
+    """What `turned` turned; of maps that were not, another of the eight views, in which bit 0 swaps first."""
+    maps = maps.swapaxes(rows, rows + 1) if way & 1 else maps
+    return jnp.flip(maps, [axis + rows - 1 for axis in (1, 2) if way >> axis & 1])
+
+
 def symmetric(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Array) -> Scores:
     """The network's scores of square maps, averaged (as logarithms) over the eight turns and mirrors of a square."""
 
     def one(way: int) -> Scores:
-        def turned(x: jax.Array) -> jax.Array:
-            x = jnp.flip(x, [axis for axis in (1, 2) if way >> axis & 1])
-            return x.swapaxes(1, 2) if way & 1 else x
-
-        def back(x: jax.Array, first: int = 1) -> jax.Array:
-            x = x.swapaxes(first, first + 1) if way & 1 else x
-            return jnp.flip(x, [axis + first - 1 for axis in (1, 2) if way >> axis & 1])
-
-        scores: Any = net.apply(params, turned(goal), turned(current), method="look")
-        return Scores(back(scores.start), back(scores.query), back(scores.key), back(scores.sight, 2))
+        scores: Any = net.apply(params, turned(goal, way), turned(current, way), method="look")
+        start, query, key = (turned_back(x, way) for x in (scores.start, scores.query, scores.key))
+        return Scores(start, query, key, turned_back(scores.sight, way, 2))
 
     every = [one(way) for way in range(8)]
     start = _log_share(sum((s.start for s in every), jnp.zeros_like(every[0].start)) / 8)
     query, key = jnp.concatenate([s.query for s in every], -1) / 8, jnp.concatenate([s.key for s in every], -1)
     return Scores(start, query, key, jnp.concatenate([s.sight for s in every], 1))
+
+
+def judge(net: StrokeNet, params: Params) -> Callable[[Scores, jax.Array], jax.Array]:
+    """The network's log-odds [B, P] that strokes [B, P, 4] (cells) are due."""
+
+    def due(scores: Scores, strokes: jax.Array) -> jax.Array:
+        odds: Any = net.apply(params, scores, strokes, method="due")
+        return odds
+
+    return due
 
 
 def likeliest(due: Callable[[Scores, jax.Array], jax.Array], scores: Scores, count: int) -> tuple[jax.Array, jax.Array]:

@@ -246,7 +246,7 @@ def test_the_policy_trenches_a_letter(here, capsys):
     assert alone["iou"] > 0.6
     assert main(["shape", "T", "--method", "policy", "--lookahead", "3", "--strokes", "4", "--out", "ahead", "--json"]) == 0
     ahead = json.loads(capsys.readouterr().out)
-    assert ahead["search"]["after"] <= alone["search"]["after"]
+    assert ahead["search"]["after"] <= alone["search"]["after"] * (1 + 1e-5)
     assert ahead["l2_reduction"] == pytest.approx(1 - ahead["search"]["after"] / ahead["search"]["before"], abs=1e-3)
     assert ahead["iou"] > 0.8
 

@@ -11,6 +11,7 @@ import pytest
 
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams, StrokeState
 from jaxsand.scene import make_scene
+from jaxsand.strokegoals import usual_scene
 from jaxsand.tool import Blade
 from tests.test_probes import prober
 from train.actor import Acts
@@ -20,7 +21,6 @@ from train.her import Future, Steps
 from train.nets import Actor, Critic, Flat, Maps
 from train.probes import ByBoth, Constant, Late
 from train.runs import learner_of, load, run
-from train.sand import usual_scene
 from train.tasks import Strokes
 
 update = jax.jit(eager_update, static_argnames="learner")

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from jaxsand.settling import steepest_slope
+from jaxsand.strokegoals import CELLS, SPACING, usual_scene
 from jaxsand.strokeloss import pushed
 from jaxsand.task import GLYPH_SQUARE
 from train.hindsight import Hindsight, _labels, _pairs, _turned
 from train.lessons import lessons
 from train.plans import MOST, random_plans
-from train.sand import CELLS, SPACING, other_scene, starts, usual_scene
+from train.sand import other_scene, starts
 
 SCENE = usual_scene()
 

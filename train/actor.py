@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
-from jaxsand.scene import Scene
-from jaxsand.tool import Blade
+from jaxsand.scene import Scene, blade_of
+from jaxsand.strokegoals import CELLS
 from train.nets import Actor, Critic
-from train.sand import CELLS
 
 _TRIED = 16  # actions for each one that is asked for
 _SEED = 0  # of how they differ from the actor's, the same at every look
@@ -42,9 +41,7 @@ class Acts:
         """
         if scene.grid.shape != (CELLS, CELLS):
             raise ValueError(f"scene.grid.shape: got {scene.grid.shape}; this policy only knows ({CELLS}, {CELLS})")
-        if not isinstance(scene.tool, Blade):
-            raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
-        depth = float(scene.tool.depth)
+        depth = float(blade_of(scene).depth)
         maps = {name: jnp.asarray(x, jnp.float32) / depth for name, x in (("goal", goal), ("current", current))}
         tried = 1 if count == 1 else _TRIED * count
         off = self.noise * np.random.default_rng(_SEED).standard_normal((tried, 4)).astype(np.float32)

@@ -23,7 +23,7 @@ import optax
 from train.backup import Backup, Every, Items, Sampled, items_of
 from train.buffer import Buffer
 from train.dqn_tasks import SingleStroke, Task
-from train.her import Final, Steps, Strategy, relabel
+from train.her import Final, Steps, Strategy, chosen, relabel
 from train.qnet import Bins, Greedy, Head, Mean, QNet
 
 
@@ -170,7 +170,7 @@ def _items(learner: Dqn, rows: Steps, key: jax.Array) -> Items:
         other = jax.vmap(lambda k, row: relabel(k, row, strategy, task.judge))(jax.random.split(draw, learner.envs), rows)
         own = jax.random.uniform(choose, (learner.envs,)) * (1 + strategy.copies) < 1
         own |= jax.vmap(lambda row: jnp.any(task.barred(row.observation)))(other)
-        rows = jax.tree.map(lambda a, b: jnp.where(own.reshape(-1, *(1,) * (a.ndim - 1)), a, b), rows, other)
+        rows = chosen(own, rows, other)
     items = jax.vmap(lambda row: items_of(row, learner.reach, learner.gamma))(rows)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), items)
 

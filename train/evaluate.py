@@ -11,9 +11,7 @@ from jaxsand.lookahead import Proposes
 from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokefigures import found_figure
 from jaxsand.strokegoals import StrokeGoal
-from jaxsand.strokeloss import SandLoss
 from jaxsand.success import right, strict, strokes_right
-from jaxsand.tool import Blade
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,8 +25,7 @@ def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: T
     rows = {}
     for number, glyph in enumerate(glyphs, 1):
         tell(f"{glyph.name}, {number} of {len(glyphs)}")
-        sand = SandLoss(glyph.scene, glyph.start, glyph.goal)
-        plan = plan_by_policy(policy, sand, len(glyph.strokes), stages)
+        plan = plan_by_policy(policy, glyph.sand, len(glyph.strokes), stages)
         rows[glyph.name] = judged(glyph, plan.strokes)
     return {
         "right": sum(row["right"] for row in rows.values()),
@@ -42,15 +39,14 @@ def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: T
 
 def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:
     """The figures of one glyph after these pushes [M, 4] (m)."""
-    depth = float(glyph.scene.tool.depth) if isinstance(glyph.scene.tool, Blade) else 0.0
-    after = SandLoss(glyph.scene, glyph.start, glyph.goal).maps(pushes[None])[0] if len(pushes) else glyph.start
+    after = glyph.sand.maps(pushes[None])[0] if len(pushes) else glyph.start
     goal, dug = glyph.goal - glyph.start, after - glyph.start
     level = np.zeros_like(goal)
     return {
-        "iou": float(task.iou(goal, dug, depth)),
+        "iou": glyph.iou(after),
         "l2_reduction": float(task.l2_reduction(goal, level, dug)),
-        "right": right(goal, dug, depth),
-        "strict": strict(goal, level, dug, depth),
+        "right": right(goal, dug, glyph.depth),
+        "strict": strict(goal, level, dug, glyph.depth),
         "strokes_right": strokes_right(glyph.strokes, pushes),
         "strokes": len(glyph.strokes),
         "pushes": [[round(float(v), 6) for v in push] for push in pushes],
@@ -63,7 +59,7 @@ def picture(glyphs: list[StrokeGoal], report: dict[str, Any]) -> "Figure":
     for glyph in glyphs:
         row = report["glyphs"][glyph.name]
         pushes = np.array(row["pushes"], float).reshape(-1, 4)
-        after = SandLoss(glyph.scene, glyph.start, glyph.goal).maps(pushes[None])[0]
+        after = glyph.sand.maps(pushes[None])[0]
         name = f"{glyph.name}*" if row["right"] else glyph.name
         shown.append((name, row["iou"], glyph.goal - glyph.start, after - glyph.start))
     return found_figure(shown)

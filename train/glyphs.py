@@ -11,10 +11,9 @@ import numpy as np
 
 from jaxsand import goals, task
 from jaxsand.scene import Scene, make_scene
-from jaxsand.strokegoals import StrokeGoal, letters, letters_on_rough_sand, stroke_goal, turned_letters
+from jaxsand.strokegoals import CELLS, SPACING, StrokeGoal, letters, letters_on_rough_sand, stroke_goal, turned_letters
 from jaxsand.tool import Blade
 from train.plans import random_plans
-from train.sand import CELLS, SPACING
 
 _SEED = 2_000_003
 

@@ -101,8 +101,9 @@ def mixed(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> Ste
         return steps
     choose, draw = jax.random.split(key)
     keeps = jax.random.uniform(choose, steps.ended.shape) * (1 + strategy.copies) < 1
+    return chosen(keeps, steps, relabel(draw, steps, strategy, judge))
 
-    def pick(own: jax.Array, other: jax.Array) -> jax.Array:
-        return jnp.where(keeps.reshape(keeps.shape + (1,) * (own.ndim - 1)), own, other)
 
-    return jax.tree.map(pick, steps, relabel(draw, steps, strategy, judge))
+def chosen(which: jax.Array, one: Steps, other: Steps) -> Steps:
+    """Along their first axis, those of `one` where `which` [N] is true, and those of the `other`."""
+    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *(1,) * (a.ndim - 1)), a, b), one, other)

@@ -20,14 +20,14 @@ import numpy as np
 import optax
 
 from jaxsand.lookahead import one_after_the_other
-from jaxsand.policy import Policy
-from jaxsand.scene import Scene
-from jaxsand.strokenet import Scores, StrokeNet, ends, likeliest, spread
+from jaxsand.policy import Policy, in_batches
+from jaxsand.scene import Scene, blade_of
+from jaxsand.strokegoals import CELLS, SPACING, usual_scene
+from jaxsand.strokenet import StrokeNet, ends, judge, likeliest, spread
 from jaxsand.success import right, strokes_right
-from jaxsand.tool import Blade
 from train.lessons import Lessons, lessons, way
 from train.plans import MOST, random_plans
-from train.sand import CELLS, SPACING, other_scene, starts, usual_scene
+from train.sand import other_scene, starts
 
 _WEIGHT = 2.0  # of the loss of pairs
 _SAME, _OTHER = 1.0, 2.5  # cells: nearer than that to a due stroke is one, farther is none
@@ -119,8 +119,7 @@ def _set_apart() -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _depth(scene: Scene) -> float:
-    assert isinstance(scene.tool, Blade)
-    return float(scene.tool.depth)
+    return float(blade_of(scene).depth)
 
 
 def _optimiser() -> optax.GradientTransformation:
@@ -128,24 +127,15 @@ def _optimiser() -> optax.GradientTransformation:
 
 
 def _choose(net: StrokeNet, params: Any, depth: float, goal: np.ndarray, current: np.ndarray) -> np.ndarray:
-    out = []
-    for first in range(0, len(goal), 64):
-        part = [np.zeros((64, CELLS, CELLS), np.float32) for _ in range(2)]
-        some = slice(first, first + 64)
-        for to, maps in zip(part, (goal, current), strict=True):
-            to[: len(maps[some])] = maps[some] / depth
-        out.append(np.asarray(_act(net, params, *part))[: len(goal[some])])
-    return np.concatenate(out) * SPACING
+    """Its likeliest strokes [B, 4] (m) at a single look, as is enough to learn by."""
+    (strokes,) = in_batches(partial(_act, net, params), goal / depth, current / depth, (64,))
+    return strokes * SPACING
 
 
 @partial(jax.jit, static_argnames="net")
-def _act(net: StrokeNet, params: Any, goal: jax.Array, current: jax.Array) -> jax.Array:
-    def due(scores: Scores, strokes: jax.Array) -> jax.Array:
-        odds: Any = net.apply(params, scores, strokes, method="due")
-        return odds
-
+def _act(net: StrokeNet, params: Any, goal: jax.Array, current: jax.Array) -> tuple[jax.Array]:
     scores: Any = net.apply(params, goal, current, method="look")
-    return likeliest(due, scores, 1)[0][:, 0]
+    return (likeliest(judge(net, params), scores, 1)[0][:, 0],)
 
 
 def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: float) -> tuple[np.ndarray, ...]:

@@ -7,21 +7,15 @@ from scipy.ndimage import gaussian_filter
 
 from jaxsand.scene import Scene, make_scene
 from jaxsand.settling import settle_batch
+from jaxsand.strokegoals import CELLS, SPACING
 from jaxsand.tool import Blade
-
-CELLS, SPACING = 32, 0.01
 
 _RELIEF = 0.015  # m, at most
 _FEATURES = (1.0, 6.0)  # cells
 
 
-def usual_scene() -> Scene:
-    """32 x 32 cells of 0.01 m, 29 degrees, the default blade: the scene in which glyphs are judged."""
-    return make_scene((CELLS, CELLS), SPACING, tool=Blade())
-
-
 def other_scene(rng: np.random.Generator) -> Scene:
-    """The same with another blade (0.015 to 0.03 m wide, 5 to 10 mm deep) and angle of repose (25 to 35 degrees)."""
+    """The usual scene with another blade (0.015 to 0.03 m wide, 5 to 10 mm deep) and angle of repose (25 to 35 degrees)."""
     blade = Blade(width=rng.uniform(0.015, 0.03), thickness=0.015, depth=rng.uniform(0.005, 0.01))
     return make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(rng.uniform(25, 35)), tool=blade)
 

@@ -6,7 +6,6 @@ A check that the environment is what others expect, and what one stroke after th
 `sb3`: pip install 'jaxsand[sb3]'.
 """
 
-import argparse
 import json
 import sys
 import time
@@ -14,22 +13,24 @@ from typing import Any
 
 import numpy as np
 
+from jaxsand.commands.arguments import Parser, count, fail
+from jaxsand.commands.arguments import seed as a_seed
+
 _LIMIT = 3  # strokes to an episode
 _JUDGED = 16  # episodes that the mean reward is taken over
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Trains, and prints strokes a second and the mean reward of an episode before and after; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m train.sb3", description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--steps", type=int, default=2_000, metavar="N", help="strokes to train for (2000)")
-    parser.add_argument("--seed", type=int, default=0, metavar="K", help="(0)")
+    parser = Parser(prog="python -m train.sb3", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--steps", type=count, default=2_000, metavar="N", help="strokes to train for (2000)")
+    parser.add_argument("--seed", type=a_seed, default=0, metavar="K", help="(0)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
     try:
         report = trained(options.steps, options.seed)
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return fail(str(error))
     print(json.dumps(report) if options.json else "\n".join(f"{name:24} {value:.4g}" for name, value in report.items()))
     return 0
 

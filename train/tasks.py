@@ -12,12 +12,12 @@ from jaxsand import task
 from jaxsand.env.library import RandomStrokes
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.lookahead import one_after_the_other
+from jaxsand.strokegoals import usual_scene
 from jaxsand.strokeloss import pushed
 from jaxsand.success import right
 from jaxsand.tool import Blade
 from train.actor import Acts
 from train.probes import Probe
-from train.sand import usual_scene
 
 _PRACTICE, _SET_APART = 2_000_029, 1_000_003  # seeds of goals
 _ENV = MultiStroke()

@@ -12,16 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.env.maps import STEPS
+from jaxsand.strokenet import turned_back as turned
 from train.qnet import Greedy
 
 VIEWS = range(8)
 """Bit 0 swaps rows and columns, then bit 1 turns rows and bit 2 columns round."""
-
-
-def turned(planes: jax.Array, view: int) -> jax.Array:
-    """Square maps [B, H, W] in another view."""
-    planes = planes.swapaxes(1, 2) if view & 1 else planes
-    return jnp.flip(planes, [axis for axis in (1, 2) if view >> axis & 1])
 
 
 def turned_steps(view: int) -> np.ndarray:

@@ -36,15 +36,14 @@ def run_shape(options: argparse.Namespace) -> None:
         )
     surface = _surface(options, target)
     out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
+    strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
     if options.method == "search":
-        strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
         target = searched(target, surface, strokes, options.pushes or 1000 * strokes, options.seed or 0, tell)
     if options.method == "optimise":
         target = optimised(target, surface, options.strokes, options.pushes or 4000, options.seed or 0, tell)
     if options.method == "policy":
         from jaxsand.stages import Stages
 
-        strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
         polish = (options.pushes or 4000) if options.refine else 0
         target = by_policy(target, surface, strokes, Stages(options.lookahead or 0, polish), tell)
     planned = time.perf_counter() - began

@@ -13,8 +13,7 @@ from jaxsand.env.pushing import Batching, ByLength, Push
 from jaxsand.env.spaces import Box, Dict
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Stop as StopRule
-from jaxsand.scene import Scene
-from jaxsand.tool import Blade
+from jaxsand.scene import Scene, blade_of
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,7 @@ class MultiStroke:
     def distance(self, state: StrokeState, params: StrokeParams) -> jax.Array:
         """L: the l2 distance of goal and map in units of the blade's depth (float32)."""
         far = task.l2(self.measure.seen(state.goal), self.measure.seen(state.height))
-        return (far / _depth(params)).astype(jnp.float32)
+        return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def stroke(self, action: jax.Array, params: StrokeParams) -> jax.Array:
         """The stroke x0, y0, x1, y1 (m) of an action [4] or longer."""
@@ -159,7 +158,7 @@ class MultiStroke:
 
     def observe(self, state: StrokeState, params: StrokeParams) -> dict[str, jax.Array]:
         maps = {"goal": state.goal, "current": state.height}
-        return {name: (x / _depth(params)).astype(jnp.float32) for name, x in maps.items()}
+        return {name: (x / blade_of(params.scene).depth).astype(jnp.float32) for name, x in maps.items()}
 
     def action_space(self, params: StrokeParams) -> Box:
         del params
@@ -173,10 +172,3 @@ def _cells(params: StrokeParams) -> jax.Array:
     """Cells between the first and the last centre, for x0, y0, x1, y1."""
     rows, columns = params.scene.grid.shape
     return jnp.array([columns - 1, rows - 1, columns - 1, rows - 1])
-
-
-def _depth(params: StrokeParams) -> Any:
-    tool = params.scene.tool
-    if not isinstance(tool, Blade):
-        raise ValueError(f"scene.tool: got {type(tool).__name__}; give make_scene(..., tool=Blade()) to push with")
-    return tool.depth

@@ -13,10 +13,10 @@ from jaxsand.env.maps import MapGoals, Walks
 from jaxsand.env.onmap import MapParams, MapState, OnMap
 from jaxsand.env.spaces import Box, Dict, Discrete
 from jaxsand.push import SteppedPush
-from jaxsand.scene import Scene
+from jaxsand.scene import Scene, blade_of
 from jaxsand.shaping import Layout
 from jaxsand.sim import act
-from jaxsand.tool import Blade, Pose, coverage
+from jaxsand.tool import Pose, coverage
 
 
 @jax.tree_util.register_dataclass
@@ -85,12 +85,12 @@ class OnSand:
     def distance(self, state: SandState, params: SandParams) -> jax.Array:
         """L: the l2 distance on what is dug, in units of the blade's depth (float32)."""
         far = task.l2(self.goal(state.walk, params), task.below(state.height))
-        return (far / _blade(params).depth).astype(jnp.float32)
+        return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def goal(self, walk: MapState, params: SandParams) -> jax.Array:
         """The goal as a height map [H, W] (m): the blade's depth under each cell to dig."""
         block = jnp.repeat(jnp.repeat(jnp.flipud(walk.dig), self.layout.cell, 0), self.layout.cell, 1)
-        return jnp.pad(jnp.where(block, -jnp.float32(_blade(params).depth), 0), self.layout.margin)
+        return jnp.pad(jnp.where(block, -jnp.float32(blade_of(params.scene).depth), 0), self.layout.margin)
 
     def at(self, place: jax.Array, params: SandParams) -> jax.Array:
         """Where the centre of a map cell (row, column; row 0 on top) lies: x, y (m)."""
@@ -98,7 +98,7 @@ class OnSand:
         return (self.layout.margin + (up + 0.5) * self.layout.cell) * params.scene.grid.spacing
 
     def observe(self, state: SandState, params: SandParams) -> dict[str, jax.Array]:
-        blade, dx = _blade(params), jnp.float32(params.scene.grid.spacing)
+        blade, dx = blade_of(params.scene), jnp.float32(params.scene.grid.spacing)
         rows, columns = params.scene.grid.shape
         x, y = ((jnp.arange(n, dtype=jnp.float32) + 0.5) * dx for n in (columns, rows))
         here = self.at(state.walk.place, params)
@@ -119,10 +119,3 @@ class OnSand:
     @property
     def _walk(self) -> OnMap:
         return OnMap(self.shape)
-
-
-def _blade(params: SandParams) -> Blade:
-    tool = params.scene.tool
-    if not isinstance(tool, Blade):
-        raise ValueError(f"scene.tool: got {type(tool).__name__}; give make_scene(..., tool=Blade()) to push with")
-    return tool

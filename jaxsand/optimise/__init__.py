@@ -17,9 +17,8 @@ from jaxsand.optimise import moves
 from jaxsand.optimise.account import Account
 from jaxsand.optimise.sketch import Print, guesses
 from jaxsand.rules import check_whole
-from jaxsand.scene import Scene, as_array
+from jaxsand.scene import Scene, as_array, blade_of
 from jaxsand.strokeloss import Best, SandLoss, pushed
-from jaxsand.tool import Blade
 
 _LANES = 4  # plans that go downhill together
 _STEPS = 6  # of Adam on blurred maps
@@ -77,8 +76,7 @@ def optimise_strokes(
     Raises:
       ValueError: for a scene without a blade, a start or goal of another shape, or a key or count out of range.
     """
-    if not isinstance(scene.tool, Blade):
-        raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
+    blade_of(scene)
     check_whole("budget", budget, 1)
     check_whole("most", most, 1, 64)
     if strokes is not None:
