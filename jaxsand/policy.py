@@ -126,7 +126,18 @@ def _loaded(path: Path) -> Policy:
             f"policy: cannot read {path} ({type(error).__name__}); train one: python -m train hindsight"
         ) from None
     net = StrokeNet(tuple(fields["widths"]), tuple(fields["blocks"]), fields["features"], fields["sights"])
+    if {name: x.shape for name, x in flat.items()} != _shapes(net):
+        raise ValueError(
+            f"policy: {path} holds no parameters of this version's network; train one: python -m train hindsight"
+        )
     return Policy(net, traverse_util.unflatten_dict(flat, sep="/"))
+
+
+def _shapes(net: StrokeNet) -> dict[str, tuple[int, ...]]:
+    """Of the network's parameters."""
+    maps = jax.ShapeDtypeStruct((1, SIDE, SIDE), jnp.float32)
+    params = jax.eval_shape(net.init, jax.random.key(0), maps, maps, jax.ShapeDtypeStruct((1, 1, 4), jnp.float32))
+    return {name: x.shape for name, x in traverse_util.flatten_dict(params, sep="/").items()}
 
 
 def _depth(scene: Scene) -> float:

@@ -22,7 +22,7 @@ _STARTS = 32  # peaks of the starts
 _ENDS = 12  # peaks of the ends from each
 _LINES = 96  # of the likeliest pairs of these, along which the network looks
 _TRUST = 0.3  # in the likelihoods of ends, beside what is seen along the line
-_ORDER = 1.0  # the weight of whether it is the next one
+_ORDER = 0.5  # the weight of whether it is the next one
 _ALONG = 12  # places that are looked at from end to end
 _BEYOND = 1.5  # cells: and one before and one behind
 _ASIDE = (-2.0, -1.0, 1.0, 2.0)  # cells to the left: there only the maps are looked at
@@ -100,12 +100,13 @@ class _Look(nn.Module):
 
 
 class _Line(nn.Module):
-    """From what is seen along lines [..., N] to six numbers for each."""
+    """From what is seen along lines [..., N] to two log-odds, and to the four moves (cells) of the ends."""
 
     @nn.compact
-    def __call__(self, seen: jax.Array) -> jax.Array:
-        x = nn.relu(nn.Dense(128)(seen))
-        return nn.Dense(6)(nn.relu(nn.Dense(64)(x)))
+    def __call__(self, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x = nn.relu(nn.Dense(64)(nn.relu(nn.Dense(128)(seen))))
+        y = nn.relu(nn.Dense(128)(nn.relu(nn.Dense(128)(seen))))
+        return nn.Dense(2)(x), _FARTHEST * jnp.tanh(nn.Dense(4)(y))
 
 
 class StrokeNet(nn.Module):
@@ -134,15 +135,14 @@ class StrokeNet(nn.Module):
         every = jnp.stack([turned_strokes(strokes, way, side) for way in range(views)], 1)
         maps = scores.sight[..., -3:-1]
         seen = [seen_along(scores.sight, every), *(seen_along(maps, every, aside) for aside in _ASIDE)]
-        said = self.line(jnp.concatenate([x.reshape(*x.shape[:3], -1) for x in seen], -1))
+        odds, move = self.line(jnp.concatenate([x.reshape(*x.shape[:3], -1) for x in seen], -1))
         ahead = _ahead(every)
         left = jnp.stack([-ahead[..., 1], ahead[..., 0]], -1)
-        move = _FARTHEST * jnp.tanh(said[..., 2:])
         ends = [every[..., :2] + move[..., :1] * ahead + move[..., 1:2] * left]
         ends.append(every[..., 2:] + move[..., 2:3] * ahead + move[..., 3:] * left)
         right = jnp.concatenate(ends, -1)
         back = jnp.stack([turned_strokes_back(right[:, way], way, side) for way in range(views)])
-        return Lines(said[..., 0].mean(1), said[..., 1].mean(1), back.mean(0))
+        return Lines(odds[..., 0].mean(1), odds[..., 1].mean(1), back.mean(0))
 
 
 def _ahead(strokes: jax.Array) -> jax.Array:
@@ -271,10 +271,10 @@ def likeliest(along: Judge, scores: Scores, count: int) -> tuple[jax.Array, jax.
         log sigmoid(due) + 0.5 log sigmoid(first) + 0.3 [log p(start) + log p(end | start)],
 
     with p of the blocks of 3 x 3 cells around peaks. The means of the likelihoods in these blocks are a stroke's ends, until
-    what is seen along it puts them right.
+    what is seen along it puts them right, twice.
     """
     strokes, log_shares = jax.lax.map(_candidates, scores)
-    lines = along(scores, strokes)
+    lines = along(scores, along(scores, strokes).strokes)
     score = jax.nn.log_sigmoid(lines.due) + _ORDER * jax.nn.log_sigmoid(lines.first) + _TRUST * log_shares
 
     def pick(strokes: jax.Array, score: jax.Array) -> tuple[jax.Array, jax.Array]:

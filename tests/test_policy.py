@@ -162,6 +162,13 @@ def test_a_policy_comes_back_from_its_file_in_half_precision(params, tmp_path):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
 
 
+def test_parameters_of_another_network_are_refused(params, tmp_path):
+    others = jax.tree.map(lambda p: p[..., :-1], params)
+    save_policy(Policy(NET, others), tmp_path / "policy.npz")
+    with pytest.raises(ValueError, match=r"policy: .*policy\.npz holds no parameters of this version's network"):
+        load_policy(tmp_path / "policy.npz")
+
+
 @pytest.mark.parametrize("content", [b"", b"no policy", None])
 def test_a_file_that_is_no_policy_is_refused(content, tmp_path):
     path = tmp_path / "policy.npz"

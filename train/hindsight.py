@@ -159,21 +159,23 @@ def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: f
 
 
 def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
-    """Pairs of ends [B, 7 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved."""
+    """Pairs of ends [B, 8 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved; at last twice
+    their own, moved a little."""
     batch, count = due.shape[:2]
     a, b, c, d = jax.random.split(key, 4)
     every = due.reshape(batch, 2 * count, 2)
     mixed = jnp.take_along_axis(every, jax.random.randint(a, (batch, 2 * count, 1), 0, 2 * count), 1)
     other = jnp.take_along_axis(due[:, :, 1], jax.random.randint(b, (batch, count, 1), 0, count), 1)
-    far = 10 ** jax.random.uniform(d, (batch, 2 * count, 2, 1), due.dtype, -1, 0.8)
-    moved = jnp.tile(due, (1, 2, 1, 1)) + far * jax.random.normal(c, (batch, 2 * count, 2, 2), due.dtype)
+    far = jax.random.uniform(d, (batch, 3 * count, 2, 1), due.dtype)
+    far = 10 ** jnp.concatenate([1.8 * far[:, :count] - 1, 1.2 * far[:, count:] - 1.3], 1)
+    moved = jnp.tile(due, (1, 3, 1, 1)) + far * jax.random.normal(c, (batch, 3 * count, 2, 2), due.dtype)
     return jnp.concatenate(
         [
             due.reshape(batch, count, 4),
             due[:, :, ::-1].reshape(batch, count, 4),
             jnp.concatenate([due[:, :, 0], other], -1),
             mixed.reshape(batch, count, 4),
-            jnp.clip(moved.reshape(batch, 2 * count, 4), 0, CELLS),
+            jnp.clip(moved.reshape(batch, 3 * count, 4), 0, CELLS),
         ],
         1,
     )
@@ -182,13 +184,12 @@ def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Labels:
-    """Whether pairs [B, P] are strokes that are `due`, as numbers, whether that is `clear`, whether they are the `first` one
-    due, and the `strokes` [B, P, 4] (cells) due that they are nearest to."""
+    """Whether pairs [B, P] are strokes that are `due`, as numbers, whether that is `clear`, and whether they are the `first`
+    one due."""
 
     due: jax.Array
     clear: jax.Array
     first: jax.Array
-    strokes: jax.Array
 
 
 def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> Labels:
@@ -196,11 +197,9 @@ def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> Labels:
     strokes = due.reshape(*due.shape[:2], 4)
     every = jnp.max(jnp.abs(pairs[:, :, None] - strokes[:, None]), -1)
     every = jnp.where(counts[:, None] > 0, every, jnp.inf)
-    off, which = jnp.min(every, -1), jnp.argmin(every, -1)
+    off = jnp.min(every, -1)
     close = off <= _SAME
-    nearest = jnp.take_along_axis(strokes, which[..., None], 1)
-    same, clear, first = (x.astype(pairs.dtype) for x in (close, close | (off >= _OTHER), close & (which == 0)))
-    return Labels(same, clear, first, nearest)
+    return Labels(*(x.astype(pairs.dtype) for x in (close, close | (off >= _OTHER), close & (jnp.argmin(every, -1) == 0))))
 
 
 @partial(jax.jit, static_argnames="learner")
@@ -228,7 +227,9 @@ def _learn(
         end = jnp.sum(spread(due[:, :, 1], shape) * ends(scores, due[:, :, 0]), (2, 3))
         wrong = _mean(optax.sigmoid_binary_cross_entropy(lines.due, label.due), label.clear)
         early = _mean(optax.sigmoid_binary_cross_entropy(lines.first, label.first), label.due)
-        off = _mean(jnp.sum(optax.huber_loss(lines.strokes, label.strokes, delta=_HUBER), -1) / _HUBER, label.due)
+        there = due.reshape(*due.shape[:2], 4)
+        moves = optax.huber_loss(lines.strokes[:, -2 * MOST :], jnp.tile(there, (1, 2, 1)), delta=_HUBER) / _HUBER
+        off = _mean(jnp.sum(moves, -1), jnp.tile(counts, (1, 2)))
         return -jnp.mean(jnp.sum(share * (start + end), 1)) + _WEIGHT * wrong + _FIRST * early + _ENDS * off
 
     value, gradient = jax.value_and_grad(loss)(params)
