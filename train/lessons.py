@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsand.scene import Scene
 from jaxsand.strokeloss import pushed
-from train.plans import MOST, anywhere, random_plans
+from train.plans import MOST, random_plans
 
 Choose = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Strokes [B, 4] (m) for goals and current maps [B, H, W] (m)."""
@@ -18,8 +18,8 @@ _ASTRAY = 0.05  # a stroke farther (m) than this from each that is due was none 
 
 @dataclass(frozen=True)
 class Lessons:
-    """`goal` and `current` maps [S, H, W] (m), and the strokes `due` [S, MOST, 4] (m), of which those `counts` [S, MOST], in
-    the order in which they made the goal; and how many `pushes` of the simulator they took."""
+    """`goal` and `current` maps [S, H, W] (m), and the strokes `due` [S, MOST, 4] (m), of which those `counts` [S, MOST];
+    and how many `pushes` of the simulator they took."""
 
     goal: np.ndarray
     current: np.ndarray
@@ -34,7 +34,6 @@ def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarra
     `start` [P, H, W] (m) are the maps at rest before the first strokes.
     """
     strokes, numbers = random_plans(rng, plans)
-    strokes = anywhere(rng, strokes)
     every = np.arange(plans)
     first = np.tile(np.arange(MOST), (plans, 1))
     goal, one = way(scene, start, strokes, numbers)
@@ -50,8 +49,7 @@ def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarra
     for turns, maps in ((first, one), (order, two)):
         for k in range(1 if maps is two and choose is None else 0, MOST):
             here = every[(numbers > k) & np.isfinite(maps[k]).all((1, 2)) & np.isfinite(goal).all((1, 2))]
-            left = np.sort(turns[here, k:], 1)  # as they made the goal, those that there are not last
-            due = np.take_along_axis(strokes[here], np.concatenate([left, turns[here, :k]], 1)[..., None], 1)
+            due = np.take_along_axis(strokes[here], turns[here][:, [*range(k, MOST), *range(k)], None], 1)
             out.append((goal[here], maps[k][here], due, np.arange(MOST) < numbers[here, None] - k))
     goals, maps, due, counts = (np.concatenate(parts) for parts in zip(*out, strict=True))
     return Lessons(goals, maps, due.astype(np.float32), counts, 2 * int(numbers.sum()))
