@@ -5,12 +5,21 @@ wrong; what to do`. Arguments are read before JAX is imported, so that --help an
 """
 
 import argparse
-import os
 import sys
 from typing import Any
 
 from jaxsand.commands import SCHEMES, run_benchmark, run_plan, run_settle, run_shape, run_trench
-from jaxsand.commands.arguments import Parser, count, fail, keep_compiled_programs, neighbours, number, path_name, seed
+from jaxsand.commands.arguments import (
+    Parser,
+    count,
+    ended,
+    keep_compiled_programs,
+    neighbours,
+    number,
+    path_name,
+    seed,
+    width,
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -18,21 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     if options.run is not run_benchmark:  # which tells compile time apart
         keep_compiled_programs()
-    try:
-        options.run(options)
-    except ValueError as error:
-        return fail(str(error))
-    except RuntimeError as error:
-        if type(error).__name__ != "OutcomeError":
-            raise
-        return fail(f"outcome: {error}")
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    return 0
+    return ended(lambda: options.run(options))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -62,7 +57,7 @@ def _shape(commands: Any) -> None:
         metavar="N",
         help="pushes that may be tried (optimise, policy --refine: 4000; search: 1000 a stroke)",
     )
-    p.add_argument("--lookahead", type=count, metavar="K", help="policy: try its K likeliest strokes on K best plans")
+    p.add_argument("--lookahead", type=width, metavar="K", help="policy: try its K likeliest strokes on K best plans")
     p.add_argument("--refine", action="store_true", help="policy: improve its plan by gradients")
     p.add_argument("--seed", type=seed, metavar="K", help="for the random choices of optimise and search (0)")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")

@@ -34,6 +34,14 @@ _PIXELS = 256  # along a panel of a picture, about
 Obs = dict[str, Any]
 
 
+def _known(space: Any, actions: Any) -> None:
+    """Raises ValueError for a step that is none of the four."""
+    if isinstance(space, spaces.Discrete):
+        steps = np.asarray(actions)
+        if steps.dtype.kind not in "iu" or (steps < 0).any() or (steps >= space.n).any():
+            raise ValueError(f"action: got {actions!r}; give 0 to {space.n - 1}: north, east, south, west")
+
+
 class _Sand(gymnasium.Env):
     """One environment: `core` and `params` as `jaxsand.make` gives them, and the `state` of its episode."""
 
@@ -54,6 +62,7 @@ class _Sand(gymnasium.Env):
         return _view(self.shown), _arrays(about)
 
     def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        _known(self.action_space, action)
         # No environment draws anything in a step: any key will do.
         out = _alone(self.core)[1](jax.random.key(0), self.state, np.asarray(action), self.params)
         obs, self.state, reward, terminated, truncated, info = out
@@ -140,6 +149,7 @@ class SandVectorEnv(VectorEnv):
         return _view(self.shown), _masked(_arrays(about), np.ones(self.num_envs, bool))
 
     def step(self, actions: Any) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        _known(self.single_action_space, actions)
         keys = jax.random.split(_key(self.np_random), self.num_envs)
         out = _together(self.core)[1](keys, self.state, np.asarray(actions), self.params)
         obs, self.state, *rest, info = out

@@ -69,7 +69,7 @@ def look_ahead(
 
 
 def _different(far: np.ndarray, maps: np.ndarray, most: int) -> list[int]:
-    """The closest, none of which is within half of its own distance of one before it."""
+    """The closest, none of which is within a third of its own distance of one before it."""
     kept: list[int] = []
     for i in np.argsort(far, kind="stable"):
         if not np.isfinite(far[i]):

@@ -2,12 +2,14 @@
 
 import json
 import math
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
@@ -121,11 +123,11 @@ def _loaded(path: Path) -> Policy:
         with np.load(path) as data:
             fields = json.loads(str(data["about"]))["net"]
             flat = {name: jnp.asarray(data[name], jnp.float32) for name in data.files if name != "about"}
-    except (OSError, ValueError, KeyError, EOFError) as error:
+        net = StrokeNet(tuple(fields["widths"]), tuple(fields["blocks"]), fields["features"], fields["sights"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(
             f"policy: cannot read {path} ({type(error).__name__}); train one: python -m train hindsight"
         ) from None
-    net = StrokeNet(tuple(fields["widths"]), tuple(fields["blocks"]), fields["features"], fields["sights"])
     if {name: x.shape for name, x in flat.items()} != _shapes(net):
         raise ValueError(
             f"policy: {path} holds no parameters of this version's network; train one: python -m train hindsight"

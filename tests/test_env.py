@@ -339,6 +339,8 @@ def test_spaces_know_what_belongs_to_them():
         (lambda: js.make("single-stroke", on=envs.OnSand(), scene=SMALL), r"^scene: got \[16, 16\] cells.*\[62, 62\]"),
         (lambda: small(goals=np.zeros((2, 5, 5))), r"^goals: got shape \[5, 5\], the scene has \[16, 16\]"),
         (lambda: small(goals=np.zeros((16, 16))), r"^goals: got shape \[16, 16\]; give one or more maps"),
+        (lambda: small(goals=[np.zeros((16, 16))]), "^goals: got list; give RandomStrokes"),
+        (lambda: small(starts="rough"), "^starts: got 'rough'; give Level"),
         (lambda: small(goals={"x": []}), "^goals: got a glyph without strokes"),
         (lambda: small(goals=envs.RandomStrokes(fewest=3, most=2)), "^goals: got RandomStrokes.*fewest <= most"),
         (lambda: small(starts=envs.Rough(-1.0)), "^starts: got Rough"),

@@ -77,6 +77,8 @@ def test_a_glyph_file_is_read_as_letters_are(tmp_path):
         ('{"A": [[0, 0, 1]]}', "'A' has no list of strokes"),
         ('{"A": [[0, 0, 1, 2]]}', "'A' has no list of strokes"),
         ('{"A": [[0, 0, 1, "x"]]}', "'A' has no list of strokes"),
+        ('{"A": [[1' + 400 * "0" + ", 0, 1, 1]]}", "'A' has no list of strokes"),
+        (100_000 * "[", "cannot read"),
     ],
 )
 def test_a_bad_glyph_file_is_refused(tmp_path, content, message):
@@ -102,9 +104,12 @@ def test_curves_count_what_was_simulated_up_to_each_validation(tmp_path, capsys)
     assert "error: " in capsys.readouterr().err
     rows = [{"kind": "train", "seconds": 30 * k, "pushes": 10.0} for k in (1, 2)]
     rows.append({"kind": "validate", "seconds": 60, "score": 0.5})
-    (run / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"kind": "tra')
     points = curve(run)
     assert (points["minutes"][0], points["simulated"][0], points["score"][0]) == (1, 20, 0.5)
     assert len(curves_figure({"run": points}).axes) == 2
     assert main([str(run), "--out", str(tmp_path / "c.png")]) == 0
     assert (tmp_path / "c.png").stat().st_size > 1000
+    (run / "metrics.jsonl").write_text('{"kind": "train", "seconds": 3}\n')
+    assert main([str(run), "--out", str(tmp_path / "c.png")]) == 2
+    assert "error: run: cannot read " in capsys.readouterr().err

@@ -152,6 +152,11 @@ def test_the_walk_on_sand_is_there_too():
 def test_what_there_is_not_is_named():
     with pytest.raises(ValueError, match="^render_mode: got 'human'; give rgb_array"):
         jaxsand.gym.MultiStrokeEnv(render_mode="human", **QUICK)
+    env = jaxsand.gym.SingleStrokeEnv()
+    env.reset(seed=0)
+    for action in (-1, 4, 1.5):
+        with pytest.raises(ValueError, match=f"^action: got {action}; give 0 to 3"):
+            env.step(action)
     with pytest.raises(ValueError, match="^wind: no option of multi-stroke"):
         jaxsand.gym.MultiStrokeEnv(wind=3)
 

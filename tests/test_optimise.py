@@ -155,6 +155,13 @@ def test_what_is_refused(bar):
             js.optimise_strokes(**({"scene": bar.scene, "goal": bar.goal} | kwargs))
 
 
+def test_a_guess_without_the_calls_to_push_it_is_not_given(bar):
+    for budget in (1, 2):
+        found = js.optimise_strokes(bar.scene, bar.goal, guess=[[0.1, 0.1, 0.2, 0.1]] * 2, budget=budget)
+        assert found.strokes.shape == (0, 4)
+        assert found.spent <= budget
+
+
 def test_a_goal_that_is_the_start_takes_no_strokes(bar):
     found = js.optimise_strokes(bar.scene, np.zeros((32, 32)), strokes=1, budget=30)
     assert found.strokes.shape == (0, 4)

@@ -14,6 +14,7 @@ from jaxsand.tool import Blade
 
 NET = StrokeNet((8, 8, 8), (1, 1, 1))
 SIDE = 32
+NPY = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1,), }".ljust(117) + b"\n" + bytes(8)
 
 
 look = jax.jit(partial(NET.apply, method="look"))
@@ -131,7 +132,7 @@ def test_parameters_of_another_network_are_refused(params, tmp_path):
         load_policy(tmp_path / "policy.npz")
 
 
-@pytest.mark.parametrize("content", [b"", b"no policy", None])
+@pytest.mark.parametrize("content", [b"", b"no policy", b"PK\x03\x04 cut off", NPY, None])
 def test_a_file_that_is_no_policy_is_refused(content, tmp_path):
     path = tmp_path / "policy.npz"
     if content is not None:

@@ -286,7 +286,13 @@ def test_a_learner_is_known_by_its_configuration_and_nothing_else_is_made():
     assert checkpoints.restored(json.loads(json.dumps(checkpoints.described(thing)))) == thing
     with pytest.raises(ValueError, match="learner: got"):
         checkpoints.described(Tiny(parts=({},)))  # type: ignore[arg-type]
-    for data in ({"is": "os:system"}, {"is": "train.her:Nothing"}, {"is": "train.her:Future", "copied": 3}, {}):
+    for data in (
+        {"is": "os:system"},
+        {"is": "train.her:Nothing"},
+        {"is": "train.her:Future", "copied": 3},
+        {},
+        {"is": "jaxsand.goals:terrain"},
+    ):
         with pytest.raises(ValueError, match="config: "):
             checkpoints.restored(data)
 

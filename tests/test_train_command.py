@@ -68,6 +68,8 @@ def test_a_run_is_trained_gone_on_with_and_told_of_in_json(tmp_path, quick, caps
     assert main(["hindsight", "--steps", "5", "--seed", "4", "--out", str(out), "--resume"]) == 0
     assert "chunks: 5" in capsys.readouterr().out
     assert quick.chunks == 5
+    assert main(["hindsight", "--steps", "5", "--seed", "4", "--out", str(out), "--resume"]) == 0
+    assert "was at its end already; give more --minutes or --steps" in capsys.readouterr().err
     assert "seed: the run in" in said(capsys, 2, "hindsight", "--steps", 9, "--seed", 5, "--out", out, "--resume")
 
 
@@ -114,7 +116,7 @@ def test_how_long_and_where_unless_told(arguments, minutes, steps, name, monkeyp
 
     def stand_in(learner, out, seed, **options):
         asked.update(options, learner=learner, out=out, seed=seed)
-        return type("Ran", (), {"chunk": 1, "seconds": 1.0, "score": 0.0, "stopped": False})
+        return type("Ran", (), {"chunk": 1, "seconds": 1.0, "score": 0.0, "stopped": False, "did": 1})
 
     monkeypatch.setattr("train.runs.run", stand_in)
     assert main(arguments) == 0
@@ -131,7 +133,7 @@ def test_a_run_s_best_policy_is_shipped_with_how_it_was_made(tmp_path, quick, ca
     assert report["bytes"] == file.stat().st_size
     about = about_policy(file)
     assert (about["seed"], about["chunks"], about["score"]) == (6, 2, 2.0)
-    assert about["command"] == "python -m train hindsight --seed 6"
+    assert about["command"] == "python -m train hindsight --seed 6 --steps 2"
     assert about["net"]["widths"] == list(SMALL.net.widths)
     with np.load(file) as arrays:
         np.testing.assert_array_equal(arrays["params/eye"], [6.0, 6.0, 6.0])
@@ -173,6 +175,11 @@ def test_mistakes_end_with_one_line_and_exit_code_2(tmp_path, quick, capsys, mon
         (["hindsight", "--minutes", "1", "--steps", "1"], "error: steps: not allowed with argument --minutes"),
         (["hindsight", "--steps", "-1"], "error: steps: got '-1'"),
         (["hindsight", "--paper"], "error: arguments: unrecognized arguments: --paper"),
+        (["hindsight", "--seed", str(2**31)], "error: seed: got '2147483648', which is no whole number from 0 to"),
+        (
+            ["evaluate", "pretrained", "--lookahead", "65"],
+            "error: lookahead: got '65', which is no whole number from 1 to 64",
+        ),
         (["sarsa"], "error: COMMAND: invalid choice: 'sarsa'"),
         ([], "error: arguments: the following arguments are required: COMMAND"),
         (["hindsight", "--resume", "--steps", "1", "--out", tmp_path / "none"], "error: out: there is no run in "),

@@ -5,8 +5,8 @@ import math
 import sys
 from typing import Any
 
-from jaxsand.commands.arguments import Parser, count, fail, keep_compiled_programs, path_name, seed
-from train.commands import MINUTES, SHIPPED, Stopped, run_evaluation, run_shipping, run_training
+from jaxsand.commands.arguments import Parser, count, ended, keep_compiled_programs, path_name, seed, width
+from train.commands import MINUTES, SHIPPED, run_evaluation, run_shipping, run_training
 
 _STEPS = {
     "hindsight": "chunks of lessons",
@@ -24,14 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
     keep_compiled_programs()
-    try:
-        options.command(options)
-    except ValueError as error:
-        return fail(str(error))
-    except (KeyboardInterrupt, Stopped) as error:
-        print(str(error) or "stopped", file=sys.stderr)
-        return 130
-    return 0
+    return ended(lambda: options.command(options))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -66,9 +59,11 @@ def _evaluation(commands: Any) -> None:
     which = p.add_mutually_exclusive_group()
     which.add_argument("--glyphs", type=path_name, metavar="FILE.json", help="names, each with strokes of the unit square")
     which.add_argument("--goals", metavar="NAME", help="a set of goals (letters); a wrong name lists them")
-    p.add_argument("--lookahead", type=count, metavar="K", help="try its K best actions on K plans, with the simulator")
+    p.add_argument("--lookahead", type=width, metavar="K", help="try its K best actions on K plans, with the simulator")
     p.add_argument("--refine", action="store_true", help="improve its plan by gradients through the simulator")
-    p.add_argument("--out", type=path_name, metavar="DIR", help="folder for the report and a picture of goals and results")
+    p.add_argument(
+        "--out", type=path_name, metavar="DIR", help="folder for the report, and for a picture of goals and results on sand"
+    )
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(command=run_evaluation)
 

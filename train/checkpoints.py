@@ -133,7 +133,11 @@ def restored(data: Any) -> Any:
         raise ValueError(f"config: got {data.get('is')!r}, which is no part of {' or '.join(_OURS)}; use a run's own file")
     try:
         kind = getattr(importlib.import_module(module), name)
+        if not (isinstance(kind, type) and is_dataclass(kind)):
+            raise TypeError("it is no dataclass")
         return kind(**{field: restored(x) for field, x in data.items() if field != "is"})
+    except ModuleNotFoundError as error:
+        raise ValueError(f"config: {data['is']} needs {error.name}; run pip install 'jaxsand[train]'") from None
     except (ImportError, AttributeError, TypeError) as error:
         raise ValueError(f"config: cannot make {data['is']} ({error}); use the version that the run was made with") from None
 

@@ -1,6 +1,7 @@
 """What the commands of `train` do."""
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ SHIPPED = Path(jaxsand.__file__).parent / "data" / "policy.npz"
 _POLISH = 4_000  # calls of the simulator for --refine
 
 
-class Stopped(Exception):  # noqa: N818
+class Stopped(KeyboardInterrupt):
     """A run was asked to stop, and did."""
 
 
@@ -43,6 +44,8 @@ def run_training(options: argparse.Namespace) -> None:
     with _watch(out, options.tensorboard) as watch:
         ran = run(learner, out, options.seed, minutes=minutes, steps=steps, resume=options.resume, tell=tell, watch=watch)
     tell("")
+    if not ran.did:
+        print(f"the run in {out} was at its end already; give more --minutes or --steps to go on", file=sys.stderr)
     report = {"run": str(out), "chunks": ran.chunk, "minutes": round(ran.seconds / 60, 3), "best_score": ran.score}
     show(options, report, lines)
     if ran.stopped:
@@ -53,7 +56,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
     """How many glyphs, or letter maps, a run's best state gets right."""
     tell = progress()
     tell("getting ready")
-    out = folder(options.out) if options.out else None
+    out = options.out
     if options.run == "pretrained":
         from jaxsand.policy import load_policy
 
@@ -68,7 +71,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
         else:
             report = _on_sand(learner.policy(state), options, tell, out)
     if out:
-        with written(out / "evaluate.json") as path:
+        with written(folder(out) / "evaluate.json") as path:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     show(options, report, _evaluated)
@@ -85,7 +88,7 @@ def run_shipping(options: argparse.Namespace) -> None:
         raise ValueError(f"run: got one of {learner.name}; jaxsand ships what hindsight learned")
     at, seed = about_run(options.run), seed_of(options.run)
     about = {
-        "command": f"python -m train hindsight --seed {seed}",
+        "command": f"python -m train hindsight --seed {seed} --steps {at.chunk}",
         "seed": seed,
         "chunks": at.chunk,
         "minutes": round(at.seconds / 60, 2),
@@ -98,7 +101,18 @@ def run_shipping(options: argparse.Namespace) -> None:
 
 
 def _learner(options: argparse.Namespace) -> tuple[Any, int | None]:
-    """The learner, and after how many chunks it ends by itself."""
+    """The learner, and after how many chunks it ends by itself.
+
+    Raises:
+      ValueError: if a package that it needs is missing.
+    """
+    try:
+        return _made(options)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{options.learner}: {error.name} is not there; run pip install 'jaxsand[train]'") from None
+
+
+def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
     if options.learner == "hindsight":
         from train.hindsight import Hindsight
 
@@ -122,6 +136,8 @@ def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], Non
         raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(SETS)}")
     glyphs = read_glyphs(existing(options.glyphs)) if options.glyphs else SETS[options.goals or "letters"]()
     stages = Stages(options.lookahead or 0, _POLISH if options.refine else 0)
+    if out:
+        folder(out)
     report = evaluate(policy, glyphs, stages, tell)
     if out:
         from jaxsand.render import save_figure

@@ -10,28 +10,34 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxsand.commands.arguments import Parser, fail, path_name
+from jaxsand.commands.arguments import Parser, ended, path_name
 from jaxsand.files import existing, written
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_COUNTS = ("pushes", "strokes", "steps")  # what a chunk's row may count, by the learner
+_COUNTS = ("pushes", "steps")  # what a chunk's row counts, by the learner
 
 
 def curve(run: Path) -> dict[str, np.ndarray]:
     """The validations of a run: minutes, what was simulated up to then, and the score.
 
     Raises:
-      ValueError: when the folder holds no metrics.
+      ValueError: when the folder holds no metrics, or others.
     """
-    rows = [json.loads(line) for line in existing(run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    file = existing(run / "metrics.jsonl")
     done, points = 0.0, []
-    for row in rows:
-        if row["kind"] == "validate":
-            points.append((row["seconds"] / 60, done, row["score"]))
-        else:
-            done += next((row[name] for name in _COUNTS if name in row), 0.0)
+    try:
+        for line in file.read_text(encoding="utf-8").splitlines(keepends=True):
+            if not line.endswith("\n"):  # cut off, or being written
+                break
+            row = json.loads(line)
+            if row["kind"] == "validate":
+                points.append((row["seconds"] / 60, done, row["score"]))
+            else:
+                done += next(row[name] for name in _COUNTS if name in row)
+    except (ValueError, KeyError, TypeError, StopIteration) as error:
+        raise ValueError(f"run: cannot read {file} ({type(error).__name__}); give folders of runs of this version") from None
     if not points:
         raise ValueError(f"run: {run} holds no validation yet; train it on with --resume")
     return dict(zip(("minutes", "simulated", "score"), np.array(points).T, strict=True))
@@ -46,7 +52,8 @@ def curves_figure(curves: dict[str, dict[str, np.ndarray]]) -> "Figure":
     for name, points in curves.items():
         for ax, by in zip(axes, ("minutes", "simulated"), strict=True):
             ax.plot(points[by], points["score"], "o-", ms=3, label=name)
-    axes[0].set(xlabel="minutes", ylabel="validation score", ylim=(0, 1))
+    axes[0].set(xlabel="minutes", ylabel="validation score")
+    axes[0].set_ylim(top=1)
     axes[1].set(xlabel="strokes or steps simulated")
     for ax in axes:
         ax.grid(alpha=0.3)
@@ -59,13 +66,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("runs", type=path_name, nargs="+", metavar="RUN")
     parser.add_argument("--out", type=path_name, required=True, metavar="FILE.png")
     options = parser.parse_args(arguments)
-    try:
-        figure = curves_figure({run.name: curve(run) for run in options.runs})
+
+    def draw() -> None:
+        names = [run.name for run in options.runs]
+        figure = curves_figure({run.name if names.count(run.name) == 1 else str(run): curve(run) for run in options.runs})
         with written(options.out) as path:
             figure.savefig(path, dpi=110, format="png")
-    except ValueError as error:
-        return fail(str(error))
-    return 0
+
+    return ended(draw)
 
 
 if __name__ == "__main__":

@@ -126,9 +126,10 @@ class Ddpg:
         return begin(self, self.world()[1], jax.random.key(seed))
 
     def advance(self, state: Practice) -> tuple[Practice, dict[str, float]]:
-        """The metrics are the mean reward of the steps made, the critic's `loss`, and the `value` of the actor's actions."""
+        """The metrics are the mean reward of the steps made, the critic's `loss`, the `value` of the actor's actions,
+        and how many `steps` were made."""
         state, metrics = practise(self, self.world()[1], state)
-        return state, {name: float(value) for name, value in metrics.items()}
+        return state, {name: float(value) for name, value in metrics.items()} | {"steps": float(self.envs * self.steps)}
 
     def validate(self, state: Practice) -> dict[str, float]:
         """What the actor alone reaches in episodes set apart; see the task."""

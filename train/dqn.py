@@ -87,9 +87,10 @@ class Dqn:
         return begin(self, jax.random.key(seed))
 
     def advance(self, state: Walking) -> tuple[Walking, dict[str, float]]:
-        """The metrics are the mean loss, the mean reward of a step, and the share of steps that finished their map."""
+        """The metrics are the mean loss, the mean reward of a step, and the share of steps that finished their map,
+        and how many `steps` were made."""
         state, metrics = practise(self, state)
-        return state, {name: float(value) for name, value in metrics.items()}
+        return state, {name: float(value) for name, value in metrics.items()} | {"steps": float(self.envs * self.steps)}
 
     def validate(self, state: Walking) -> dict[str, float]:
         """What greedy walks reach on goals set apart; see the task."""

@@ -26,7 +26,7 @@ def read_glyphs(path: Path) -> list[StrokeGoal]:
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         why = type(error).__name__
         raise ValueError(f"glyphs: cannot read {path} ({why}); give a JSON file of names and strokes") from None
     if not isinstance(table, dict) or not table:
@@ -38,7 +38,7 @@ def _strokes(name: str, strokes: Any) -> np.ndarray:
     try:
         array = np.array(strokes, float)
         good = array.ndim == 2 and array.shape[1] == 4 and len(array) and np.all((array >= 0) & (array <= 1))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         good = False
     if not good:
         raise ValueError(f"glyphs: {name!r} has no list of strokes [x0, y0, x1, y1] from 0 to 1; give some, y goes up")

@@ -6,8 +6,8 @@ Hindsight makes every plan of random strokes a success to learn from (goal-condi
 
     loss = -1/n sum_r [log p(s_r) + log p(e_r | s_r)] + the logistic loss of pairs of ends (is such a stroke due or not).
 
-From some time on half of the lessons come from its own strokes (as in DAgger, Ross et al. 2011), so that it learns to go on
-from its mistakes. No letter is ever seen.
+From some time on every second chunk holds lessons on the way of its own strokes too (as in DAgger, Ross et al. 2011), so
+that it learns to go on from its mistakes. No letter is ever seen.
 """
 
 from dataclasses import dataclass
@@ -153,7 +153,7 @@ def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: f
 
 
 def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
-    """Pairs of ends [B, 6 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved."""
+    """Pairs of ends [B, 5 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved."""
     batch, count = due.shape[:2]
     a, b, c, d = jax.random.split(key, 4)
     every = due.reshape(batch, 2 * count, 2)

@@ -19,7 +19,7 @@ _ASTRAY = 0.05  # a stroke farther (m) than this from each that is due was none 
 @dataclass(frozen=True)
 class Lessons:
     """`goal` and `current` maps [S, H, W] (m), and the strokes `due` [S, MOST, 4] (m), of which those `counts` [S, MOST];
-    and how many `pushes` of the simulator they took."""
+    and how many `pushes` of the simulator they took at most."""
 
     goal: np.ndarray
     current: np.ndarray

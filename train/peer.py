@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from matplotlib.path import Path as Outline
 
-from jaxsand.commands.arguments import Parser, count, seed
+from jaxsand.commands.arguments import Parser, count, ended, seed
 from jaxsand.files import as_json, as_table, progress
 from jaxsand.optimise import optimise_strokes
 from jaxsand.policy import load_policy
@@ -81,7 +81,7 @@ def _polygon(rng: np.random.Generator) -> np.ndarray:
 
 
 def methods(pushes: int, key: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
-    """What finds strokes [N, 4] (m), at most twelve, by a cost of about so many pushes."""
+    """What finds strokes [N, 4] (m), at most twelve; gradients and the search at a cost of about so many pushes."""
     policy = load_policy()
     return {
         "policy, looking ahead": lambda s: plan_by_policy(policy, s, _STROKES, Stages(width=6)).strokes,
@@ -134,9 +134,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=seed, default=0, metavar="K")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
-    rows = compare(options.goals, options.pushes, options.seed, progress())
-    print(as_json({"rows": rows}) if options.json else "\n".join(as_table(rows, "method")))
-    return 0
+
+    def show() -> None:
+        rows = compare(options.goals, options.pushes, options.seed, progress())
+        print(as_json({"rows": rows}) if options.json else "\n".join(as_table(rows, "method")))
+
+    return ended(show)
 
 
 if __name__ == "__main__":

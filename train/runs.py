@@ -41,7 +41,7 @@ class Learner(Protocol):
 
     @property
     def every(self) -> int:
-        """Chunks from one validation to the next: by count, so that which state is best does not hang on the clock."""
+        """Chunks from one validation to the next, by count; a run also validates where it ends."""
 
     def init(self, seed: int) -> State:
         """The state before the first chunk."""
@@ -56,13 +56,14 @@ class Learner(Protocol):
 @dataclass(frozen=True)
 class Ran:
     """What came of a run: the `state` after `chunk` chunks and `seconds` of work in all, the best `score` so far (-inf
-    before the first validation), and whether it was asked to stop before its end."""
+    before the first validation), whether it was asked to stop before its end, and how many chunks it `did` now."""
 
     state: State
     chunk: int
     seconds: float
     score: float
     stopped: bool
+    did: int
 
 
 def run(
@@ -137,7 +138,7 @@ def run(
             tell(_line(learner, chunk, rate, score, best, _to_go(chunk, rate, spent(), minutes, steps)))
         if asked and chunk > first:
             keep(_LAST)
-    return Ran(state, chunk, spent(), best, stopped=bool(asked))
+    return Ran(state, chunk, spent(), best, stopped=bool(asked), did=chunk - first)
 
 
 def load(out: Path, learner: Learner, which: Literal["best", "last"] = "best") -> State:
@@ -156,6 +157,8 @@ def learner_of(out: Path) -> Learner:
       ValueError: if there is no run, or none that this version can make.
     """
     learner: Learner = restored(_config(out)["learner"])
+    if not hasattr(learner, "advance"):
+        raise ValueError(f"config: {out / _CONFIG} holds no learner but {learner!r}; use a run's own file")
     return learner
 
 
@@ -189,6 +192,7 @@ def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State,
         raise ValueError(f"out: there is a run in {out}; go on with --resume, or choose another folder")
     if resume and not there:
         raise ValueError(f"out: there is no run in {out} to go on with; leave --resume out, or check the name")
+    state = learner.init(seed)
     folder(out)
     if there:
         _compare(_config(out), described(learner), seed, out)
@@ -197,7 +201,6 @@ def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State,
         config = {"name": learner.name, "seed": seed, "learner": described(learner), "versions": versions}
         with written(out / _CONFIG) as beside:
             beside.write_text(as_json(config, indent=1) + "\n", encoding="utf-8")
-    state = learner.init(seed)
     return load_state(out / _LAST, state) if (out / _LAST).exists() else (state, At())
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.commands.arguments import Parser, count, fail
+from jaxsand.commands.arguments import Parser, count, ended
 from jaxsand.commands.arguments import seed as a_seed
 
 _LIMIT = 3  # strokes to an episode
@@ -27,12 +27,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=a_seed, default=0, metavar="K", help="(0)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
-    try:
+
+    def show() -> None:
         report = trained(options.steps, options.seed)
-    except ValueError as error:
-        return fail(str(error))
-    print(json.dumps(report) if options.json else "\n".join(f"{name:24} {value:.4g}" for name, value in report.items()))
-    return 0
+        print(json.dumps(report) if options.json else "\n".join(f"{name:24} {value:.4g}" for name, value in report.items()))
+
+    return ended(show)
 
 
 def trained(steps: int, seed: int) -> dict[str, float]:

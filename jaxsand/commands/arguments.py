@@ -3,8 +3,12 @@
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
+
+WIDEST = 64
+_LAST_SEED = 2**31 - 1  # what every generator takes
 
 
 class Parser(argparse.ArgumentParser):
@@ -41,10 +45,36 @@ def count(text: str) -> int:
     return int(text)
 
 
-def seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number of at least 0")
+def width(text: str) -> int:
+    """Of a look-ahead, which pushes its square at every stroke."""
+    if not text.isdecimal() or not 1 <= int(text) <= WIDEST:
+        raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number from 1 to {WIDEST}")
     return int(text)
+
+
+def seed(text: str) -> int:
+    if not text.isdecimal() or int(text) > _LAST_SEED:
+        raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number from 0 to {_LAST_SEED}")
+    return int(text)
+
+
+def ended(work: Callable[[], None]) -> int:
+    """The exit code of a command: 0, or what its mistakes, the keyboard and closed pipes end it with."""
+    try:
+        work()
+    except ValueError as error:
+        return fail(str(error))
+    except RuntimeError as error:
+        if type(error).__name__ != "OutcomeError":
+            raise
+        return fail(f"outcome: {error}")
+    except KeyboardInterrupt as error:
+        print(str(error) or "stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return 0
 
 
 def fail(message: str) -> int:

@@ -24,7 +24,8 @@ _GLYPH_MAP = 0.32  # m: the side of the map that the glyphs' square is given for
 
 @dataclass(frozen=True)
 class RandomStrokes:
-    """So many goals of `fewest` to `most` random strokes in the glyphs' square, none shorter than a part of its side."""
+    """So many goals of `fewest` to `most` random strokes in the glyphs' square, none shorter than a part of its side, up to
+    a half."""
 
     goals: int = 256
     fewest: int = 1
@@ -33,8 +34,8 @@ class RandomStrokes:
 
     def plans(self, rng: np.random.Generator) -> list[np.ndarray]:
         """Strokes [n, 4] of the unit square for each goal."""
-        if not (self.goals >= 1 and 1 <= self.fewest <= self.most and 0 <= self.shortest < 1):
-            raise ValueError(f"goals: got {self}; give one goal or more, 1 <= fewest <= most, and shortest from 0 to 1")
+        if not (self.goals >= 1 and 1 <= self.fewest <= self.most and 0 <= self.shortest <= 0.5):
+            raise ValueError(f"goals: got {self}; give one goal or more, 1 <= fewest <= most, and shortest from 0 to 0.5")
         drawn = rng.random((_TRIES, self.goals, self.most, 4))
         long = np.hypot(*np.moveaxis(drawn[..., 2:] - drawn[..., :2], -1, 0)) >= self.shortest
         first = np.argmax(long, axis=0)[None, ..., None]
@@ -56,7 +57,7 @@ class Rough:
     scale: float = 3.0
 
 
-Goals = RandomStrokes | Mapping[str, Any] | np.ndarray
+Goals = RandomStrokes | Mapping[str, Any] | np.ndarray | jax.Array
 """Random strokes, or names with strokes [n, 4] of the unit square as a glyph file has them, or maps [G, H, W] (m)."""
 
 
@@ -66,6 +67,10 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
     Raises:
       ValueError: for goals that are none, or are not of the scene's shape.
     """
+    if not isinstance(starts, Level | Rough):
+        raise ValueError(f"starts: got {starts!r}; give Level() or Rough()")
+    if isinstance(goals, jax.Array):
+        goals = np.asarray(goals)
     rng = np.random.default_rng(seed)
     if isinstance(goals, np.ndarray):
         if goals.ndim != 3 or not len(goals):
@@ -73,6 +78,8 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
         task.fits(scene, goals[0], "goals")
         task.finite(goals, "goals")
         plans, count = [], len(goals)
+    elif not isinstance(goals, RandomStrokes | Mapping):
+        raise ValueError(f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, or maps [G, H, W]")
     else:
         plans = goals.plans(rng) if isinstance(goals, RandomStrokes) else [np.asarray(s, float) for s in goals.values()]
         if not plans or any(some.ndim != 2 or some.shape[1] != 4 or not len(some) for some in plans):

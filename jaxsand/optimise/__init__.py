@@ -152,7 +152,9 @@ def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator)
 
 
 def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Generator, smoothing: Blurred | None) -> None:
-    """Rounds of moves until the goal is reached or the budget is spent."""
+    """Rounds of moves until the goal is reached or the budget is spent; none if no plan could be pushed yet."""
+    if not account.history:
+        return
     dx = float(account.sand.scene.grid.spacing)
     plans = moves.reordered(account, plans)
     for blur in smoothing.cells if smoothing else ():
