@@ -120,7 +120,7 @@ def _shipped() -> Policy:
 
 def _loaded(path: Path) -> Policy:
     try:
-        with np.load(path) as data:
+        with path.open("rb") as file, np.load(file) as data:
             fields = json.loads(str(data["about"]))["net"]
             flat = {name: jnp.asarray(data[name], jnp.float32) for name in data.files if name != "about"}
         net = StrokeNet(tuple(fields["widths"]), tuple(fields["blocks"]), fields["features"], fields["sights"])
