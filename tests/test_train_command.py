@@ -134,7 +134,8 @@ def test_a_run_s_best_policy_is_shipped_with_how_it_was_made(tmp_path, quick, ca
     about = about_policy(file)
     assert (about["seed"], about["chunks"], about["score"]) == (6, 2, 2.0)
     assert about["command"] == "python -m train hindsight --seed 6 --steps 2"
-    assert about["net"]["widths"] == list(SMALL.net.widths)
+    fields = {name: getattr(SMALL.net, name) for name in ("widths", "blocks", "features", "sights")}
+    assert about["net"] == json.loads(json.dumps(fields))
     with np.load(file) as arrays:
         np.testing.assert_array_equal(arrays["params/eye"], [6.0, 6.0, 6.0])
 

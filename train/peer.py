@@ -21,7 +21,7 @@ from jaxsand.commands.arguments import Parser, count, ended, seed
 from jaxsand.files import as_json, as_table, progress
 from jaxsand.optimise import optimise_strokes
 from jaxsand.policy import load_policy
-from jaxsand.sandplan import SandPlan, plan_sand
+from jaxsand.sandplan import plan_sand
 from jaxsand.scene import Scene, make_scene
 from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokeloss import SandLoss
@@ -86,13 +86,9 @@ def methods(pushes: int, key: int) -> dict[str, Callable[[SandLoss], np.ndarray]
     return {
         "policy, looking ahead": lambda s: plan_by_policy(policy, s, _STROKES, Stages(width=6)).strokes,
         "the same, then gradients": lambda s: plan_by_policy(policy, s, _STROKES, Stages(6, pushes)).strokes,
-        "plan_sand": lambda s: _searched(s, pushes, key).strokes,
+        "plan_sand": lambda s: plan_sand(s.scene, s.start, s.goal, strokes=_STROKES, budget=pushes, seed=key).strokes,
         "optimise_strokes": lambda s: optimise_strokes(s.scene, s.goal, strokes=_STROKES, key=key, budget=pushes).strokes,
     }
-
-
-def _searched(sand: SandLoss, pushes: int, key: int) -> SandPlan:
-    return plan_sand(sand.scene, sand.start, sand.goal, strokes=_STROKES, budget=pushes, seed=key)
 
 
 def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:

@@ -192,11 +192,11 @@ def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State,
         raise ValueError(f"out: there is a run in {out}; go on with --resume, or choose another folder")
     if resume and not there:
         raise ValueError(f"out: there is no run in {out} to go on with; leave --resume out, or check the name")
-    state = learner.init(seed)
     folder(out)
     if there:
         _compare(_config(out), described(learner), seed, out)
-    else:
+    state = learner.init(seed)  # what cannot begin leaves no run
+    if not there:
         versions = {name: metadata.version(name) for name in _PACKAGES} | {"python": platform.python_version()}
         config = {"name": learner.name, "seed": seed, "learner": described(learner), "versions": versions}
         with written(out / _CONFIG) as beside:
