@@ -3,7 +3,8 @@
 A U-Net looks at both maps and gives, for every cell, how likely a stroke that is due starts there, and a query and a key: a
 stroke from cell s ends at cell e with a likelihood in proportion to exp(query(s) . key(e)), so that all pairs of cells are
 compared at once. Ends that belong to strokes are easy to see; which belong together is seen along the line between them, and
-so a second, small network reads what the first makes of the cells on the way and says whether a stroke is due there.
+so a second, small network reads what the first makes of the cells on the way and says whether a stroke is due there, and
+where exactly its ends are, as the second stage of a detector does (Ren et al. 2015).
 """
 
 import math
@@ -23,18 +24,31 @@ _LINES = 96  # of the likeliest pairs of these, along which the network looks
 _TRUST = 0.3  # in the likelihoods of ends, beside what is seen along the line
 _ALONG = 12  # places that are looked at from end to end
 _BEYOND = 1.5  # cells: and one before and one behind
+_ASIDE = (-2.0, -1.0, 1.0, 2.0)  # cells to the left: there only the maps are looked at
+_FARTHEST = 1.5  # cells: an end is moved by less
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Scores:
     """What the network says of every cell: the log-likelihood that a stroke `start`s there [B, H, W], the `query` and the
-    `key` [B, H, W, K] by which starts find their ends, and what lines see there, `sight` [B, V, H, W, C] in V views."""
+    `key` [B, H, W, K] by which starts find their ends, and what lines see there, `sight` [B, V, H, W, C], in V views, each
+    turned its own way; the last three of its channels are the goal, the sand and their difference."""
 
     start: jax.Array
     query: jax.Array
     key: jax.Array
     sight: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lines:
+    """What is seen along strokes: the log-odds [B, P] that such a stroke is `due`, and the `strokes` [B, P, 4] (cells) with
+    their ends put right."""
+
+    due: jax.Array
+    strokes: jax.Array
 
 
 class _Block(nn.Module):
@@ -84,12 +98,12 @@ class _Look(nn.Module):
 
 
 class _Line(nn.Module):
-    """From what is seen along lines [..., L, C] to the log-odds [...] that a stroke is due there."""
+    """From what is seen along lines [..., N] to the log-odds, and to the four moves of the ends ahead and to the left."""
 
     @nn.compact
     def __call__(self, seen: jax.Array) -> jax.Array:
-        x = nn.relu(nn.Dense(64)(seen.reshape(*seen.shape[:-2], -1)))
-        return nn.Dense(1)(nn.relu(nn.Dense(32)(x)))[..., 0]
+        x = nn.relu(nn.Dense(128)(seen))
+        return nn.Dense(5)(nn.relu(nn.Dense(64)(x)))
 
 
 class StrokeNet(nn.Module):
@@ -105,36 +119,56 @@ class StrokeNet(nn.Module):
         self.eye = _Look(self.widths, self.blocks, self.features, self.sights)
         self.line = _Line()
 
-    def __call__(self, goal: jax.Array, current: jax.Array, strokes: jax.Array) -> tuple[Scores, jax.Array]:
+    def __call__(self, goal: jax.Array, current: jax.Array, strokes: jax.Array) -> tuple[Scores, Lines]:
         scores = self.eye(goal, current)
-        return scores, self.due(scores, strokes)
+        return scores, self.along(scores, strokes)
 
     def look(self, goal: jax.Array, current: jax.Array) -> Scores:
         return self.eye(goal, current)
 
-    def due(self, scores: Scores, strokes: jax.Array) -> jax.Array:
-        """The log-odds [B, P] that strokes [B, P, 4] (cells) are due; the mean of all views."""
-        return self.line(seen_along(scores.sight, strokes)).mean(1)
+    def along(self, scores: Scores, strokes: jax.Array) -> Lines:
+        """What is seen along strokes [B, P, 4] (cells); the mean of all views."""
+        views, side = scores.sight.shape[1], scores.sight.shape[2]
+        every = jnp.stack([turned_strokes(strokes, way, side) for way in range(views)], 1)
+        maps = scores.sight[..., -3:-1]
+        seen = [seen_along(scores.sight, every), *(seen_along(maps, every, aside) for aside in _ASIDE)]
+        said = self.line(jnp.concatenate([x.reshape(*x.shape[:3], -1) for x in seen], -1))
+        ahead = _ahead(every)
+        left = jnp.stack([-ahead[..., 1], ahead[..., 0]], -1)
+        move = _FARTHEST * jnp.tanh(said[..., 1:])
+        ends = [every[..., :2] + move[..., :1] * ahead + move[..., 1:2] * left]
+        ends.append(every[..., 2:] + move[..., 2:3] * ahead + move[..., 3:] * left)
+        right = jnp.concatenate(ends, -1)
+        back = jnp.stack([turned_strokes_back(right[:, way], way, side) for way in range(views)])
+        return Lines(said[..., 0].mean(1), back.mean(0))
 
 
-def seen_along(sight: jax.Array, strokes: jax.Array) -> jax.Array:
-    """What lies along strokes [B, P, 4] (cells), bilinear, from a little before to a little behind: [B, V, P, L, C]."""
+def _ahead(strokes: jax.Array) -> jax.Array:
+    """Unit vectors [..., 2] along strokes [..., 4]; 0 where a stroke has no length."""
+    way = strokes[..., 2:] - strokes[..., :2]
+    return way / jnp.maximum(jnp.sqrt(jnp.sum(way**2, -1, keepdims=True)), 1e-6)
+
+
+def seen_along(sight: jax.Array, strokes: jax.Array, aside: float = 0.0) -> jax.Array:
+    """What lies along strokes [B, V, P, 4] (cells) on maps [B, V, H, W, C], bilinear, from a little before to a little
+    behind, and so far `aside` (cells) to the left: [B, V, P, L, C]."""
+    ahead = _ahead(strokes)[..., None, :]
     a, b = strokes[..., None, :2], strokes[..., None, 2:]
-    ahead = (b - a) / jnp.maximum(jnp.linalg.norm(b - a, axis=-1, keepdims=True), 1e-6)
-    part = jnp.linspace(0, 1, _ALONG, dtype=sight.dtype)[None, None, :, None]
+    part = jnp.linspace(0, 1, _ALONG, dtype=sight.dtype)[:, None]
     points = jnp.concatenate([a - _BEYOND * ahead, a + part * (b - a), b + _BEYOND * ahead], -2)
+    points = points + aside * jnp.concatenate([-ahead[..., 1:], ahead[..., :1]], -1)
     batch, views, rows, columns, channels = sight.shape
     at = jnp.stack([jnp.clip(points[..., k] - 0.5, 0, n - 1.001) for k, n in enumerate((columns, rows))], -1)
     low = jnp.floor(at).astype(jnp.int32)
     part = at - low
     flat = sight.reshape(batch, views, rows * columns, channels)
-    out = jnp.zeros((batch, views, *points.shape[1:3], channels), sight.dtype)
+    out = jnp.zeros((*points.shape[:-1], channels), sight.dtype)
     for i in (0, 1):
         for j in (0, 1):
             cell = (low[..., 1] + i) * columns + low[..., 0] + j
             weight = jnp.abs(1 - i - part[..., 1]) * jnp.abs(1 - j - part[..., 0])
-            value = jax.vmap(lambda maps, cell: maps[:, cell])(flat, cell)
-            out = out + weight[:, None, ..., None] * value
+            value = jax.vmap(jax.vmap(lambda maps, cell: maps[cell]))(flat, cell)
+            out = out + weight[..., None] * value
     return out
 
 
@@ -190,6 +224,20 @@ def turned_back(maps: jax.Array, way: int, rows: int = 1) -> jax.Array:
     return jnp.flip(maps, [axis + rows - 1 for axis in (1, 2) if way >> axis & 1])
 
 
+def turned_strokes(strokes: jax.Array, way: int, side: float) -> jax.Array:
+    """Strokes [..., 4] (cells) on square maps of so many cells a side, turned as `turned` turns the maps."""
+    x, y = strokes[..., ::2], strokes[..., 1::2]
+    x, y = side - x if way >> 2 & 1 else x, side - y if way >> 1 & 1 else y
+    x, y = (y, x) if way & 1 else (x, y)
+    return jnp.stack([x[..., 0], y[..., 0], x[..., 1], y[..., 1]], -1)
+
+
+def turned_strokes_back(strokes: jax.Array, way: int, side: float) -> jax.Array:
+    """What `turned_strokes` turned."""
+    swapped = strokes[..., jnp.array([1, 0, 3, 2])] if way & 1 else strokes
+    return turned_strokes(swapped, way & ~1, side)
+
+
 def symmetric(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Array) -> Scores:
     """The network's scores of square maps, averaged (as logarithms) over the eight turns and mirrors of a square."""
     ways = range(8)
@@ -197,30 +245,35 @@ def symmetric(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Arra
     every: Any = net.apply(params, *views, method="look")
     every = jax.tree.map(lambda x: x.reshape(len(ways), -1, *x.shape[1:]), every)
     start, query, key = ([turned_back(x[way], way) for way in ways] for x in (every.start, every.query, every.key))
-    sight = jnp.concatenate([turned_back(every.sight[way], way, 2) for way in ways], 1)
     mean = _log_share(jnp.stack(start).mean(0))
+    sight = jnp.moveaxis(every.sight[:, :, 0], 0, 1)
     return Scores(mean, jnp.concatenate(query, -1) / len(ways), jnp.concatenate(key, -1), sight)
 
 
-def judge(net: StrokeNet, params: Params) -> Callable[[Scores, jax.Array], jax.Array]:
-    """The network's log-odds [B, P] that strokes [B, P, 4] (cells) are due."""
-
-    def due(scores: Scores, strokes: jax.Array) -> jax.Array:
-        odds: Any = net.apply(params, scores, strokes, method="due")
-        return odds
-
-    return due
+Judge = Callable[[Scores, jax.Array], Lines]
 
 
-def likeliest(due: Callable[[Scores, jax.Array], jax.Array], scores: Scores, count: int) -> tuple[jax.Array, jax.Array]:
+def judge(net: StrokeNet, params: Params) -> Judge:
+    """What the network sees along strokes [B, P, 4] (cells)."""
+
+    def along(scores: Scores, strokes: jax.Array) -> Lines:
+        lines: Any = net.apply(params, scores, strokes, method="along")
+        return lines
+
+    return along
+
+
+def likeliest(along: Judge, scores: Scores, count: int) -> tuple[jax.Array, jax.Array]:
     """The `count` likeliest strokes [B, count, 4] (cells), none like another, and their scores [B, count]:
 
         log sigmoid(due) + 0.3 [log p(start) + log p(end | start)],
 
-    with p of the blocks of 3 x 3 cells around peaks. A stroke's ends are the means of the likelihoods in their blocks.
+    with p of the blocks of 3 x 3 cells around peaks. The means of the likelihoods in these blocks are a stroke's ends, until
+    what is seen along it puts them right.
     """
     strokes, log_shares = jax.lax.map(_candidates, scores)
-    score = jax.nn.log_sigmoid(due(scores, strokes)) + _TRUST * log_shares
+    lines = along(scores, strokes)
+    score = jax.nn.log_sigmoid(lines.due) + _TRUST * log_shares
 
     def pick(strokes: jax.Array, score: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(score: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
@@ -230,7 +283,7 @@ def likeliest(due: Callable[[Scores, jax.Array], jax.Array], scores: Scores, cou
 
         return jax.lax.scan(one, score, None, length=count)[1]
 
-    return jax.vmap(pick)(strokes, score)
+    return jax.vmap(pick)(lines.strokes, score)
 
 
 def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:

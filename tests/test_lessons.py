@@ -10,7 +10,7 @@ from jaxsand.strokeloss import pushed
 from jaxsand.task import GLYPH_SQUARE
 from train.hindsight import Hindsight, _labels, _pairs, _turned
 from train.lessons import lessons
-from train.plans import MOST, random_plans
+from train.plans import MOST, anywhere, random_plans
 from train.sand import other_scene, starts
 
 SCENE = usual_scene()
@@ -43,6 +43,20 @@ def test_plans_fill_the_square_with_strokes_of_some_length():
     np.testing.assert_array_equal(strokes, again)
 
 
+def test_plans_are_moved_over_the_whole_map():
+    strokes, _ = random_plans(rng(), 2000)
+    moved = anywhere(rng(1), strokes)
+    same = np.all(moved == strokes, axis=(1, 2))
+    assert 0.4 < same.mean() < 0.6
+    assert 0 < moved.min() < 0.02
+    assert 0.3 < moved.max() < 0.32
+    old, new = (x[~same] for x in (strokes, moved))
+    scale = np.ptp(new[..., ::2], (1, 2)) / np.ptp(old[..., ::2], (1, 2))
+    assert 0.6 <= scale.min() < 0.65
+    assert 1.05 < scale.max() <= 1.1 + 1e-9
+    np.testing.assert_allclose(np.ptp(new[..., 1::2], (1, 2)) / np.ptp(old[..., 1::2], (1, 2)), scale)
+
+
 def test_strokes_due_lead_to_the_goal():
     start = starts(SCENE, rng(1), 8, rough=0.5)
     lesson = lessons(SCENE, rng(), 8, start)
@@ -58,7 +72,9 @@ def test_strokes_due_lead_to_the_goal():
 
 
 def test_its_own_way_leaves_what_it_did_not_do():
-    strokes, numbers = random_plans(rng(), 6)
+    generator = rng()
+    strokes, numbers = random_plans(generator, 6)
+    strokes = anywhere(generator, strokes)
     level = np.zeros((6, CELLS, CELLS), np.float32)
     goals = lessons(SCENE, rng(), 6, level).goal[:6]
 
@@ -90,11 +106,16 @@ def test_turned_lessons_are_as_true():
 def test_pairs_are_labelled_by_the_strokes_due():
     due = np.array([[[[4, 4], [20, 4]], [[9, 9], [9, 25]]]], np.float32)
     pairs = _pairs(jax.random.key(0), due)
-    for counts, first in ((np.array([[True, True]]), [1, 1, 1, 1]), (np.array([[True, False]]), [1, 0, 0, 0])):
-        label, matters = _labels(pairs, due.reshape(1, 2, 2, 2), counts)
-        np.testing.assert_array_equal(label[0, :2], first[:2])
-        assert np.all(np.asarray(matters[0, :2]) == 1)
-        np.testing.assert_array_equal(label[0, 2:4], [0, 0])  # turned round they are none
+    for counts, own in ((np.array([[True, True]]), [1, 1]), (np.array([[True, False]]), [1, 0])):
+        label = _labels(pairs, due, counts)
+        np.testing.assert_array_equal(label.due[0, :2], own)
+        np.testing.assert_array_equal(label.due[0, 2:4], [0, 0])  # turned round they are none
+        assert np.all(np.asarray(label.clear[0, :4]) == 1)
+    near = pairs[0, 10:]  # moved ones
+    off = np.abs(near[:, None] - due.reshape(1, 2, 4)).max(-1)
+    label = _labels(pairs, due, np.array([[True, True]]))
+    np.testing.assert_array_equal(label.due[0, 10:], off.min(1) <= 1)
+    np.testing.assert_array_equal(label.strokes[0, 10:], due.reshape(2, 4)[off.argmin(1)])
 
 
 def test_sand_to_practise_on_is_at_rest_and_varied():

@@ -1,5 +1,6 @@
 """The policy's network, how strokes are read off it, and its file."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -9,7 +10,20 @@ import pytest
 
 from jaxsand.policy import Policy, load_policy, save_policy
 from jaxsand.scene import make_scene
-from jaxsand.strokenet import Scores, StrokeNet, ends, likeliest, seen_along, spread, symmetric
+from jaxsand.strokenet import (
+    Lines,
+    Scores,
+    StrokeNet,
+    ends,
+    likeliest,
+    seen_along,
+    spread,
+    symmetric,
+    turned,
+    turned_back,
+    turned_strokes,
+    turned_strokes_back,
+)
 from jaxsand.tool import Blade
 
 NET = StrokeNet((8, 8, 8), (1, 1, 1))
@@ -18,7 +32,7 @@ NPY = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'sh
 
 
 look = jax.jit(partial(NET.apply, method="look"))
-due = jax.jit(partial(NET.apply, method="due"))
+along = jax.jit(partial(NET.apply, method="along"))
 of_all_views = jax.jit(partial(symmetric, NET))
 
 
@@ -48,25 +62,39 @@ def test_points_are_spread_over_the_cells_around_them():
 
 def test_lines_see_what_lies_on_them():
     y, x = jnp.meshgrid(jnp.arange(SIDE) + 0.5, jnp.arange(SIDE) + 0.5, indexing="ij")
-    sight = jnp.stack([x, y], -1)[None, None]
-    seen = seen_along(sight, jnp.array([[[4.0, 8.0, 20.0, 24.0]]]))[0, 0, 0]
+    sight, stroke = jnp.stack([x, y], -1)[None, None], jnp.array([[[[4.0, 8.0, 20.0, 24.0]]]])
+    seen = seen_along(sight, stroke)[0, 0, 0]
     np.testing.assert_allclose(seen[1], [4, 8], atol=1e-5)
     np.testing.assert_allclose(seen[-2], [20, 24], atol=1e-5)
     np.testing.assert_allclose(seen[0], [4 - 1.5 / np.sqrt(2), 8 - 1.5 / np.sqrt(2)], atol=1e-5)
     np.testing.assert_allclose(np.diff(seen[1:-1, 0]), 16 / 11, atol=1e-5)
+    left = seen_along(sight, stroke, np.sqrt(2))[0, 0, 0]
+    np.testing.assert_allclose(left - seen, np.tile([-1, 1], (len(seen), 1)), atol=1e-5)
+
+
+@pytest.mark.parametrize("way", range(8))
+def test_strokes_turn_with_their_maps(way):
+    stroke = jnp.array([3.5, 8.5, 20.5, 25.5])
+    x0, y0, x1, y1 = turned_strokes(stroke, way, SIDE)
+    ends = jnp.zeros((1, SIDE, SIDE)).at[0, 8, 3].set(1).at[0, 25, 20].set(2)
+    there = turned(ends, way)[0]
+    assert (there[int(y0), int(x0)], there[int(y1), int(x1)]) == (1, 2)
+    np.testing.assert_array_equal(turned_back(there[None], way), ends)
+    np.testing.assert_allclose(turned_strokes_back(jnp.stack([x0, y0, x1, y1]), way, SIDE), stroke)
 
 
 def test_what_is_symmetric_turns_with_its_maps(params):
     goal, current = maps(0), maps(1)
     strokes = jnp.array([[[4.0, 8.0, 20.0, 24.0], [9.0, 3.0, 11.0, 30.0]]] * 2, jnp.float32)
     one = of_all_views(params, goal, current)
-    odds = due(params, one, strokes)
-    for flip in (False, True):
-        turn = (lambda x: jnp.flip(x, 2)) if flip else (lambda x: x.swapaxes(1, 2))
-        moved = strokes.at[..., ::2].set(SIDE - strokes[..., ::2]) if flip else strokes[..., jnp.array([1, 0, 3, 2])]
-        other = of_all_views(params, turn(goal), turn(current))
-        np.testing.assert_allclose(other.start, turn(one.start), atol=1e-4)
-        np.testing.assert_allclose(due(params, other, moved), odds, atol=1e-4)
+    lines = along(params, one, strokes)
+    assert np.abs(lines.strokes - strokes).max() > 0.01
+    for way in (1, 2, 4, 7):
+        other = of_all_views(params, turned(goal, way), turned(current, way))
+        np.testing.assert_allclose(other.start, turned(one.start, way), atol=1e-4)
+        seen = along(params, other, turned_strokes(strokes, way, SIDE))
+        np.testing.assert_allclose(seen.due, lines.due, atol=1e-4)
+        np.testing.assert_allclose(seen.strokes, turned_strokes(lines.strokes, way, SIDE), atol=1e-4)
 
 
 def test_the_likeliest_strokes_are_read_between_the_peaks():
@@ -77,14 +105,21 @@ def test_the_likeliest_strokes_are_read_between_the_peaks():
         query[int(y0), int(x0), k] = 20
         key[int(y1), int(x1), k] = 1
     scores = Scores(*(jnp.asarray(x, jnp.float32)[None] for x in (start, query, key, np.zeros((1, SIDE, SIDE, 1)))))
-    strokes, score = likeliest(lambda _, strokes: jnp.zeros(strokes.shape[:2], strokes.dtype), scores, 2)
+
+    def alike(_, strokes):
+        return Lines(jnp.zeros(strokes.shape[:2], strokes.dtype), strokes)
+
+    strokes, score = likeliest(alike, scores, 2)
     np.testing.assert_allclose(strokes[0], wanted, atol=0.1)
     assert score[0, 0] > score[0, 1]
 
     def second_only(_, strokes):
         return jnp.where(jnp.abs(strokes[..., 0] - 8.5) < 1, 20.0, -20.0).astype(strokes.dtype)
 
-    np.testing.assert_allclose(likeliest(second_only, scores, 1)[0][0, 0], wanted[1], atol=0.1)
+    found, _ = likeliest(lambda *a: replace(alike(*a), due=second_only(*a)), scores, 1)
+    np.testing.assert_allclose(found[0, 0], wanted[1], atol=0.1)
+    moved, _ = likeliest(lambda *a: replace(alike(*a), strokes=a[1] + 0.25), scores, 2)
+    np.testing.assert_allclose(moved[0], wanted + 0.25, atol=0.1)
 
 
 @pytest.mark.parametrize("shape", [(32, 32), (20, 32), (40, 70), (1, 5)])

@@ -4,7 +4,8 @@ strokes are still to come.
 Hindsight makes every plan of random strokes a success to learn from (goal-conditioned supervised learning, Ghosh et al.
 2019), and no reward is needed. With s the starts and e the ends of the n strokes due, all as good as each other,
 
-    loss = -1/n sum_r [log p(s_r) + log p(e_r | s_r)] + the logistic loss of pairs of ends (is such a stroke due or not).
+    loss = -1/n sum_r [log p(s_r) + log p(e_r | s_r)] + the losses of pairs of ends: a logistic one (is such a stroke due or
+           not) and Huber's of the ends of one that is.
 
 From some time on every second chunk holds lessons on the way of its own strokes too (as in DAgger, Ross et al. 2011), so
 that it learns to go on from its mistakes. No letter is ever seen.
@@ -25,11 +26,14 @@ from jaxsand.scene import Scene, blade_of
 from jaxsand.strokegoals import CELLS, SPACING, usual_scene
 from jaxsand.strokenet import StrokeNet, ends, judge, likeliest, spread
 from jaxsand.success import right, strokes_right
+from jaxsand.task import iou
 from train.lessons import Lessons, lessons, way
 from train.plans import MOST, random_plans
 from train.sand import other_scene, starts
 
-_WEIGHT = 2.0  # of the loss of pairs
+_WEIGHT = 2.0  # of the loss of pairs: are they due
+_ENDS = 4.0  # and how far are their ends off (cells)
+_HUBER = 0.05  # cells
 _SAME, _OTHER = 1.0, 2.5  # cells: nearer than that to a due stroke is one, farther is none
 _SET_APART = 1_000_003  # the seed of the goals that it is validated on
 _TRIALS = 64  # such goals
@@ -54,10 +58,10 @@ class Hindsight:
     `other`, is of another blade and another angle of repose."""
 
     plans: int = 192
-    batch: int = 128
-    rate: float = 1.5e-3
+    batch: int = 16
+    rate: float = 7e-4
     decay: int = 30  # chunks after which the learning rate falls as 1 / sqrt(chunk)
-    memory: float = 0.996  # of the moving average
+    memory: float = 0.9995  # of the moving average
     own: int = 20
     rough: float = 0.2
     other: int = 3
@@ -97,13 +101,14 @@ class Hindsight:
 
     def validate(self, state: Progress) -> dict[str, float]:
         """What the policy alone makes of goals of random strokes set apart: the share that is `right`, the share of
-        `strokes` that are, and their mean, `score`."""
+        `strokes` that are, the `iou`, and the mean of the three, `score`."""
         scene, strokes, numbers, goals = _set_apart()
         plans, maps = one_after_the_other(self.policy(state), scene, np.zeros_like(goals), goals, MOST)
         rows = [(strokes[k, :n], plans[k, :n], maps[n, k], goals[k]) for k, n in enumerate(numbers)]
         good = float(np.mean([right(goal, after, _depth(scene)) for _, _, after, goal in rows]))
         made = sum(strokes_right(a, b) for a, b, _, _ in rows) / float(numbers.sum())
-        return {"score": (good + made) / 2, "right": good, "strokes": made}
+        same = float(np.mean([iou(goal, after, _depth(scene)) for _, _, after, goal in rows]))
+        return {"score": (good + made + same) / 3, "right": good, "strokes": made, "iou": same}
 
     def policy(self, state: Progress) -> Policy:
         """What acts."""
@@ -153,32 +158,46 @@ def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: f
 
 
 def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
-    """Pairs of ends [B, 5 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved."""
+    """Pairs of ends [B, 7 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved."""
     batch, count = due.shape[:2]
     a, b, c, d = jax.random.split(key, 4)
     every = due.reshape(batch, 2 * count, 2)
     mixed = jnp.take_along_axis(every, jax.random.randint(a, (batch, 2 * count, 1), 0, 2 * count), 1)
     other = jnp.take_along_axis(due[:, :, 1], jax.random.randint(b, (batch, count, 1), 0, count), 1)
-    far = 10 ** jax.random.uniform(d, (batch, count, 2, 1), due.dtype, -1, 0.8)
-    moved = due + far * jax.random.normal(c, due.shape, due.dtype)
+    far = 10 ** jax.random.uniform(d, (batch, 2 * count, 2, 1), due.dtype, -1, 0.8)
+    moved = jnp.tile(due, (1, 2, 1, 1)) + far * jax.random.normal(c, (batch, 2 * count, 2, 2), due.dtype)
     return jnp.concatenate(
         [
             due.reshape(batch, count, 4),
             due[:, :, ::-1].reshape(batch, count, 4),
             jnp.concatenate([due[:, :, 0], other], -1),
             mixed.reshape(batch, count, 4),
-            jnp.clip(moved.reshape(batch, count, 4), 0, CELLS),
+            jnp.clip(moved.reshape(batch, 2 * count, 4), 0, CELLS),
         ],
         1,
     )
 
 
-def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whether pairs [B, P, 4] are strokes that are due, and whether that is clear."""
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Labels:
+    """Whether pairs [B, P] are strokes that are `due`, as numbers, whether that is `clear`, and the `strokes` [B, P, 4]
+    (cells) due that they are nearest to."""
+
+    due: jax.Array
+    clear: jax.Array
+    strokes: jax.Array
+
+
+def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> Labels:
+    """Of pairs [B, P, 4], for strokes [B, R, 2, 2] of which those `counts` [B, R] are due."""
     strokes = due.reshape(*due.shape[:2], 4)
-    off = jnp.max(jnp.abs(pairs[:, :, None] - strokes[:, None]), -1)
-    off = jnp.min(jnp.where(counts[:, None] > 0, off, jnp.inf), -1)
-    return (off <= _SAME).astype(pairs.dtype), ((off <= _SAME) | (off >= _OTHER)).astype(pairs.dtype)
+    every = jnp.max(jnp.abs(pairs[:, :, None] - strokes[:, None]), -1)
+    every = jnp.where(counts[:, None] > 0, every, jnp.inf)
+    off, which = jnp.min(every, -1), jnp.argmin(every, -1)
+    close = off <= _SAME
+    nearest = jnp.take_along_axis(strokes, which[..., None], 1)
+    return Labels(close.astype(pairs.dtype), (close | (off >= _OTHER)).astype(pairs.dtype), nearest)
 
 
 @partial(jax.jit, static_argnames="learner")
@@ -195,22 +214,27 @@ def _learn(
     """A step of gradient descent on a batch: the new parameters, average and optimiser's state, and the loss."""
     params, average, state = learned
     pairs = _pairs(jax.random.key(key), due)
-    is_due, matters = _labels(pairs, due, counts)
+    label = _labels(pairs, due, counts)
 
     def loss(params: Any) -> jax.Array:
         made: Any = learner.net.apply(params, goal, current, pairs)
-        scores, odds = made
+        scores, lines = made
         share = counts / jnp.sum(counts, 1, keepdims=True)
         shape = (goal.shape[1], goal.shape[2])
         start = jnp.einsum("brij,bij->br", spread(due[:, :, 0], shape), scores.start)
         end = jnp.sum(spread(due[:, :, 1], shape) * ends(scores, due[:, :, 0]), (2, 3))
-        wrong = jnp.sum(matters * optax.sigmoid_binary_cross_entropy(odds, is_due)) / jnp.sum(matters)
-        return -jnp.mean(jnp.sum(share * (start + end), 1)) + _WEIGHT * wrong
+        wrong = _mean(optax.sigmoid_binary_cross_entropy(lines.due, label.due), label.clear)
+        off = _mean(jnp.sum(optax.huber_loss(lines.strokes, label.strokes, delta=_HUBER), -1) / _HUBER, label.due)
+        return -jnp.mean(jnp.sum(share * (start + end), 1)) + _WEIGHT * wrong + _ENDS * off
 
     value, gradient = jax.value_and_grad(loss)(params)
     rate = learner.rate * jnp.minimum(1.0, jnp.sqrt(learner.decay / (chunk + 1.0))) * jnp.minimum(1.0, (chunk + 1) / 8)
     update, state = _optimiser().update(gradient, state, params)
     params = jax.tree.map(lambda p, u: p - rate * u, params, update)
-    memory = jnp.minimum(learner.memory, (10.0 * chunk + 1) / (10.0 * chunk + 20))
+    memory = jnp.minimum(learner.memory, 1 - 0.015 * learner.batch / (chunk + 2))
     average = jax.tree.map(lambda a, p: memory * a + (1 - memory) * p, average, params)
     return (params, average, state), value
+
+
+def _mean(values: jax.Array, weights: jax.Array) -> jax.Array:
+    return jnp.sum(weights * values) / jnp.sum(weights)

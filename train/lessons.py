@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsand.scene import Scene
 from jaxsand.strokeloss import pushed
-from train.plans import MOST, random_plans
+from train.plans import MOST, anywhere, random_plans
 
 Choose = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Strokes [B, 4] (m) for goals and current maps [B, H, W] (m)."""
@@ -34,6 +34,7 @@ def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarra
     `start` [P, H, W] (m) are the maps at rest before the first strokes.
     """
     strokes, numbers = random_plans(rng, plans)
+    strokes = anywhere(rng, strokes)
     every = np.arange(plans)
     first = np.tile(np.arange(MOST), (plans, 1))
     goal, one = way(scene, start, strokes, numbers)
@@ -47,7 +48,7 @@ def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarra
         order, two = _own_way(scene, start, strokes, numbers, goal, choose)
     out = []
     for turns, maps in ((first, one), (order, two)):
-        for k in range(1 if maps is two and choose is None else 0, MOST):
+        for k in range(1 if maps is two else 0, MOST):
             here = every[(numbers > k) & np.isfinite(maps[k]).all((1, 2)) & np.isfinite(goal).all((1, 2))]
             due = np.take_along_axis(strokes[here], turns[here][:, [*range(k, MOST), *range(k)], None], 1)
             out.append((goal[here], maps[k][here], due, np.arange(MOST) < numbers[here, None] - k))

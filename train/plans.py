@@ -10,6 +10,9 @@ MOST = 8
 _COUNTS = np.array([0.06, 0.16, 0.22, 0.22, 0.14, 0.10, 0.06, 0.04])
 _SHORTEST = 0.15  # of the square
 _TRIES = 16
+_MOVED = 0.5  # of the plans
+_SCALES = (0.6, 1.1)
+_EDGE = 0.01  # m, from the map's border to a moved square
 
 
 def random_plans(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -25,6 +28,17 @@ def random_plans(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.n
     low, high = GLYPH_SQUARE
     margin = 0.04 * (high - low)
     return low - margin + strokes * (high - low + 2 * margin), numbers
+
+
+def anywhere(rng: np.random.Generator, plans: np.ndarray) -> np.ndarray:
+    """Half of these plans made smaller or a little larger, and put anywhere on the map."""
+    low, high = GLYPH_SQUARE
+    shape = (len(plans), 1, 1)
+    scale = rng.uniform(*_SCALES, shape)
+    free = low + high - 2 * _EDGE - scale * (high - low)
+    corner = _EDGE + np.maximum(free, 0) * rng.random((len(plans), 1, 2))
+    moved = (plans - low) * scale + np.tile(corner, 2)
+    return np.where(rng.random(shape) < _MOVED, moved, plans)
 
 
 def _one_more(rng: np.random.Generator, earlier: np.ndarray) -> np.ndarray:

@@ -15,9 +15,9 @@ _FEATURES = (1.0, 6.0)  # cells
 
 
 def other_scene(rng: np.random.Generator) -> Scene:
-    """The usual scene with another blade (0.015 to 0.03 m wide, 5 to 10 mm deep) and angle of repose (25 to 35 degrees)."""
-    blade = Blade(width=rng.uniform(0.015, 0.03), thickness=0.015, depth=rng.uniform(0.005, 0.01))
-    return make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(rng.uniform(25, 35)), tool=blade)
+    """The usual scene with another blade (15 to 32 mm wide, 4.5 to 11 mm deep) and angle of repose (23 to 36 degrees)."""
+    blade = Blade(width=rng.uniform(0.015, 0.032), thickness=0.015, depth=rng.uniform(0.0045, 0.011))
+    return make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(rng.uniform(23, 36)), tool=blade)
 
 
 def starts(scene: Scene, rng: np.random.Generator, count: int, rough: float) -> np.ndarray:
