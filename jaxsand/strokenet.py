@@ -154,7 +154,7 @@ def seen_along(sight: jax.Array, strokes: jax.Array, aside: float = 0.0) -> jax.
     behind, and so far `aside` (cells) to the left: [B, V, P, L, C]."""
     ahead = _ahead(strokes)[..., None, :]
     a, b = strokes[..., None, :2], strokes[..., None, 2:]
-    part = jnp.linspace(0, 1, _ALONG, dtype=sight.dtype)[:, None]
+    part = jnp.linspace(0, 1, _ALONG, dtype=sight.dtype)[None, None, None, :, None]
     points = jnp.concatenate([a - _BEYOND * ahead, a + part * (b - a), b + _BEYOND * ahead], -2)
     points = points + aside * jnp.concatenate([-ahead[..., 1:], ahead[..., :1]], -1)
     batch, views, rows, columns, channels = sight.shape
