@@ -19,12 +19,9 @@ from jaxsand.strokenet import (
     seen_along,
     spread,
     symmetric,
-    turned,
-    turned_back,
-    turned_strokes,
-    turned_strokes_back,
 )
 from jaxsand.tool import Blade
+from jaxsand.turns import turned, turned_back, turned_strokes, turned_strokes_back
 
 NET = StrokeNet((8, 8, 8), (1, 1, 1))
 SIDE = 32
