@@ -31,8 +31,8 @@ _FILE = "policy.npz"
 class Policy:
     """A network and its parameters. Made by `python -m train hindsight`; `load_policy()` gives the one that jaxsand ships.
 
-    It learned on maps of 32 x 32 cells with blades two cells wide; larger maps are looked at part by part, smaller ones are
-    padded with level sand.
+    It learned on maps of 32 x 32 cells with blades about two cells wide; larger maps are looked at part by part, smaller
+    ones are padded with level sand.
     """
 
     net: StrokeNet

@@ -136,7 +136,7 @@ class StrokeNet(nn.Module):
         seen = [seen_along(scores.sight, every), *(seen_along(maps, every, aside) for aside in _ASIDE)]
         said = self.line(jnp.concatenate([x.reshape(*x.shape[:3], -1) for x in seen], -1))
         ahead = _ahead(every)
-        left = jnp.stack([-ahead[..., 1], ahead[..., 0]], -1)
+        left = _left_of(ahead)
         move = _FARTHEST * jnp.tanh(said[..., 1:])
         ends = [every[..., :2] + move[..., :1] * ahead + move[..., 1:2] * left]
         ends.append(every[..., 2:] + move[..., 2:3] * ahead + move[..., 3:] * left)
@@ -151,6 +151,11 @@ def _ahead(strokes: jax.Array) -> jax.Array:
     return way / jnp.maximum(jnp.sqrt(jnp.sum(way**2, -1, keepdims=True)), 1e-6)
 
 
+def _left_of(ahead: jax.Array) -> jax.Array:
+    """Vectors [..., 2] a quarter turn to the left of others."""
+    return jnp.stack([-ahead[..., 1], ahead[..., 0]], -1)
+
+
 def seen_along(sight: jax.Array, strokes: jax.Array, aside: float = 0.0) -> jax.Array:
     """What lies along strokes [B, V, P, 4] (cells) on maps [B, V, H, W, C], bilinear, from a little before to a little
     behind, and so far `aside` (cells) to the left: [B, V, P, L, C]."""
@@ -158,7 +163,7 @@ def seen_along(sight: jax.Array, strokes: jax.Array, aside: float = 0.0) -> jax.
     a, b = strokes[..., None, :2], strokes[..., None, 2:]
     part = jnp.linspace(0, 1, _ALONG, dtype=sight.dtype)[None, None, None, :, None]
     points = jnp.concatenate([a - _BEYOND * ahead, a + part * (b - a), b + _BEYOND * ahead], -2)
-    points = points + aside * jnp.concatenate([-ahead[..., 1:], ahead[..., :1]], -1)
+    points = points + aside * _left_of(ahead)
     batch, views, rows, columns, channels = sight.shape
     at = jnp.stack([jnp.clip(points[..., k] - 0.5, 0, n - 1.001) for k, n in enumerate((columns, rows))], -1)
     low = jnp.floor(at).astype(jnp.int32)
