@@ -32,6 +32,6 @@ def turned(stroke: Sequence[float], side: float) -> list[tuple[Callable, tuple[f
     ]
 
 
-@pytest.fixture(params=["float32", "float64"])
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def dtype(request: pytest.FixtureRequest) -> str:
     return request.param

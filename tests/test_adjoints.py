@@ -43,7 +43,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("name", WAYS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if "window" in n else pytest.mark.slow) for n in WAYS])
 def test_a_path_of_two_legs(name):
     options = dict(WAYS[name])
     walls, angle = options.pop("walls", None), jnp.asarray(options.pop("angle", 0.5))

@@ -50,6 +50,7 @@ def test_one_noisy_collapse_tells_the_angle_and_how_well():
     assert abs(np.mean(pulls)) < 0.65  # three of its standard deviations
 
 
+@pytest.mark.slow
 def test_the_bench_finds_errors_as_large_as_stated():
     """The rms over six angles of what has standard normal errors lies in 0.4 to 1.7 in 99 of 100 cases."""
     for row in bench_calibrate(seeds=6):
@@ -86,6 +87,7 @@ def test_the_errors_are_the_cramer_rao_bound():
     assert abs(off(found, 29)) < 0.01
 
 
+@pytest.mark.slow
 def test_regions_have_angles_of_their_own_and_level_sand_tells_none():
     """A pillar in each of two regions; in the third no sand slides."""
     labels = np.digitize(X, [0.12, 0.24])
@@ -102,6 +104,7 @@ def test_regions_have_angles_of_their_own_and_level_sand_tells_none():
     assert found.model.material.repose_angle.shape == SHAPE
 
 
+@pytest.mark.slow
 def test_what_the_data_do_not_tell_is_said():
     guess = sand(25, js.Blade())
     found = js.calibrate(guess, js.Trial(PILLAR, collapsed(29) + noise(3)), free=("depth", "repose_angle"))

@@ -221,6 +221,7 @@ def test_plan_with_an_end_turns_and_a_picture(here, capsys):
     assert json.loads(data.read_text())["path"] == report["path"]
 
 
+@pytest.mark.slow
 def test_search_on_real_sand(here, capsys):
     y, x = np.indices((16, 20)) * 1.0
     goal = 0.004 * np.sin(x / 3) * np.cos(y / 4)
@@ -244,6 +245,12 @@ def test_the_policy_trenches_a_letter(here, capsys):
     assert (alone["method"], alone["goal_kind"], alone["steps"]) == ("policy", "glyph", 2)
     assert alone["search"]["rollouts"] == 2
     assert alone["iou"] > 0.6
+
+
+@pytest.mark.slow
+def test_the_policy_looks_ahead(here, capsys):
+    assert main(["shape", "T", "--method", "policy", "--out", "alone", "--json"]) == 0
+    alone = json.loads(capsys.readouterr().out)
     assert main(["shape", "T", "--method", "policy", "--lookahead", "3", "--strokes", "4", "--out", "ahead", "--json"]) == 0
     ahead = json.loads(capsys.readouterr().out)
     assert ahead["search"]["after"] <= alone["search"]["after"] * (1 + 1e-5)
@@ -251,7 +258,9 @@ def test_the_policy_trenches_a_letter(here, capsys):
     assert ahead["iou"] > 0.8
 
 
-@pytest.mark.parametrize("goal", ["white-S.png", "dip.npy", "terrain", "7"])
+@pytest.mark.parametrize(
+    "goal", ["dip.npy", "7", *(pytest.param(name, marks=pytest.mark.slow) for name in ("white-S.png", "terrain"))]
+)
 def test_other_goals(here, capsys, goal):
     from jaxsand.goals import letter_map
 

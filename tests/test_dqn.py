@@ -15,7 +15,7 @@ from train.dqn import Dqn, begin, practise
 from train.dqn_tasks import Asking, SingleStroke
 from train.evaluate_maps import beams, evaluate, fewest, walks
 from train.her import Own, Steps
-from train.probes import QUESTIONS, Probe, Two
+from train.probes import QUESTIONS, ByBoth, Probe, Two
 from train.qnet import Bins, Greedy, Mean, QNet, around, dueling
 from train.shapes import Shapes, among, shape_pool
 from train.views import VIEWS, Symmetric, turned, turned_steps
@@ -50,8 +50,11 @@ def same(a, b):
     return all(np.array_equal(x, y) for x, y in zip(plain[:half], plain[half:], strict=True))
 
 
-SLOW = pytest.mark.slow  # the other way to targets, which is as long in compiling again
-ASKED = [pytest.param(q, b, marks=() if type(b) is Every else SLOW) for b in (Every(), Sampled()) for q in QUESTIONS]
+ASKED = [  # the other way to targets, and the other questions, are as long in compiling again
+    pytest.param(q, b, marks=() if type(b) is Every and type(q) is ByBoth else pytest.mark.slow)
+    for b in (Every(), Sampled())
+    for q in QUESTIONS
+]
 
 
 @pytest.mark.parametrize(("question", "backup"), ASKED, ids=lambda x: type(x).__name__)
@@ -162,6 +165,7 @@ def test_where_there_is_no_room_for_an_action_it_has_no_weight():
     np.testing.assert_allclose(weights, [[0.25] * 4, [0] * 4])
 
 
+@pytest.mark.slow
 def test_only_legal_actions_are_chosen_when_learning_and_when_walking():
     state, _ = practise(TINY, TINY.init(3))
     kept, number = state.memory.experience, TINY.envs * TINY.steps
@@ -214,6 +218,7 @@ def test_letters_and_maps_set_apart_are_never_drawn():
     np.testing.assert_array_equal(SingleStroke().barred(look), [True, False])
 
 
+@pytest.mark.slow
 def test_a_chunk_is_a_function_of_the_state_and_may_be_vmapped_over_seeds():
     state = TINY.init(0)
     one, _ = TINY.advance(state)
@@ -226,7 +231,7 @@ def test_a_chunk_is_a_function_of_the_state_and_may_be_vmapped_over_seeds():
         assert a.ndim < 3 or not np.array_equal(a[0], a[1])
 
 
-@pytest.mark.parametrize("learner", [TINY, pytest.param(replace(TINY, backup=Sampled(), reach=3), marks=SLOW)])
+@pytest.mark.parametrize("learner", [TINY, pytest.param(replace(TINY, backup=Sampled(), reach=3), marks=pytest.mark.slow)])
 def test_small_maps_are_learned_and_a_beam_does_no_worse(learner):
     learner = replace(learner, rate=1e-2)
     pool = shape_pool(Shapes(), jax.random.key(5), 64, (3, 3), jnp.zeros((0, 3, 3), bool))

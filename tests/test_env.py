@@ -17,6 +17,7 @@ from jaxsand.settling import steepest_slope
 from .conftest import MU
 
 KEY = jax.random.key(0)
+SLOW = pytest.mark.slow
 LETTERS = envs.map_pool([goals.letter_map(name)[0] for name in "ALTR"])
 QUICK = js.SteppedPush(1.0, 1)
 SMALL = js.make_scene((16, 16), 0.01, tool=js.Blade())
@@ -39,6 +40,9 @@ def on_sand():
     return js.make("single-stroke", on=envs.OnSand((3, 3), push=QUICK), goals=one_map(np.ones((3, 3), bool)), limit=40)
 
 
+each = pytest.mark.parametrize("make", [walks, pytest.param(on_sand, marks=SLOW), small])
+
+
 def batch(env, params, count):
     keys, draws = (jax.random.split(key, count) for key in jax.random.split(KEY))
     obs, state = jax.vmap(env.reset, (0, None))(keys, params)
@@ -46,7 +50,7 @@ def batch(env, params, count):
     return keys, obs, state, actions
 
 
-@pytest.mark.parametrize("make", [walks, on_sand, small])
+@each
 def test_spaces_hold_and_one_is_as_many(make):
     env, params = make()
     keys, obs, state, actions = batch(env, params, 5)
@@ -64,7 +68,7 @@ def test_spaces_hold_and_one_is_as_many(make):
     chex.assert_trees_all_close(eager, jax.tree.map(lambda x: x[0], many), atol=2e-5)
 
 
-@pytest.mark.parametrize("make", [walks, on_sand, small])
+@each
 def test_a_new_episode_begins_where_one_ended(make):
     env, params = make()
     params = replace(params, limit=jnp.array(2))
@@ -87,7 +91,7 @@ def test_a_new_episode_begins_where_one_ended(make):
     assert np.abs(np.asarray(alone[0]["current"]) - np.asarray(obs["current"])).max() > 0.5
 
 
-@pytest.mark.parametrize("make", [walks, on_sand, small])
+@each
 def test_rewards_add_up_to_what_was_gained(make):
     env, params = make()
     measure = env.left if isinstance(env, envs.OnMap) else lambda state: env.distance(state, params)
@@ -102,7 +106,7 @@ def test_rewards_add_up_to_what_was_gained(make):
     assert begun != float(measure(state))
 
 
-@pytest.mark.parametrize("make", [walks, on_sand, small])
+@each
 def test_numbers_never_retrace(make):
     env, params = make()
     chex.clear_trace_counter()
@@ -182,6 +186,7 @@ def test_random_walks_are_maps_of_one_piece():
     assert not any(min(np.ptp(np.argwhere(dig), axis=0)) == 0 for dig in np.asarray(turning.dig))
 
 
+@pytest.mark.slow
 def test_a_glyphs_own_strokes_make_it():
     strokes = goals.letter_strokes("T")
     env, params = js.make("multi-stroke", goals={"T": strokes}, limit=len(strokes))
@@ -244,6 +249,7 @@ def test_rough_starts_are_at_rest_and_their_goals_are_made_from_them():
     assert (changed.min(1) > 0.1).all()
 
 
+@pytest.mark.slow
 def test_the_angle_of_repose_may_differ_from_one_environment_to_the_next():
     env, params = small(batching=ByLength(2, 2))
     angles = jnp.array([0.3, 0.5, 0.6, 0.45, 0.35])
@@ -261,7 +267,9 @@ def test_the_angle_of_repose_may_differ_from_one_environment_to_the_next():
     assert len(np.unique(np.asarray(many[2]).round(4))) == 5
 
 
-@pytest.mark.parametrize(("size", "chunk", "parts"), [(7, 2, 2), (1, 4, 3), (5, 8, 1)])
+@pytest.mark.parametrize(
+    ("size", "chunk", "parts"), [(7, 2, 2), pytest.param(1, 4, 3, marks=SLOW), pytest.param(5, 8, 1, marks=SLOW)]
+)
 def test_sorting_a_batch_changes_no_map(size, chunk, parts):
     """Whatever is numpy's and whatever is batched; the angles test does it with a real push."""
 

@@ -125,6 +125,7 @@ def check_finite(kind, count, seed=0, batch=500):
     assert not wrong, "\n".join(map(str, [numbers, *wrong[:5]]))
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_in_2000_cases():
     check_finite(KINDS[0], 2000)
 

@@ -67,6 +67,7 @@ def test_the_gradient_of_settling_is_that_of_its_sweeps():
         assert np.allclose(a, b, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_blade_of_no_width_has_finite_derivatives():
     def pushed(size):
         scene = replace(js.make_scene((12, 12), 0.01), tool=js.Blade(size[0], size[1], 0.0075))
@@ -137,6 +138,7 @@ def test_the_loop_stops_where_told_and_is_differentiated_as_its_steps(bound):
     )
 
 
+@pytest.mark.slow
 def test_a_blade_at_the_edge_of_its_window_has_a_finite_derivative_by_the_spacing():
     def pushed(dx):
         scene = js.make_scene((12, 12), dx, tool=js.Blade(0.05, 0.05, 0.0075), window=js.Window((4, 4)))

@@ -66,6 +66,7 @@ def test_where_strokes_cross_prints_one_after_the_other_come_closer_than_their_s
     assert ours < 0.75 * summed
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_the_losses_and_are_counted(tee):
     counted = account(tee, 1000)
     plan = tee.strokes[None] + 1e-3 * np.random.default_rng(0).standard_normal((1, 2, 4))

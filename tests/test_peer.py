@@ -39,7 +39,7 @@ def test_figures_at_known_answers():
 
 @pytest.mark.slow
 def test_every_method_digs():
-    rows = compare(1, 400, 0, lambda _: None)
+    rows = compare(1, 12, 400, 0, lambda _: None)
     assert len(rows) == 4 + len(PUBLISHED)
     for row in rows[:4]:
         assert row["mm"] < 0.7 * row["before_mm"]

@@ -53,6 +53,7 @@ def test_split_meets_the_exact_relaxation(table):
     assert figures["depth_error_mm"] < 0.3
 
 
+@pytest.mark.slow
 def test_split_converges_and_own_reaches_the_papers_depth():
     """On the 2 mm of the table; `own` against the exact relaxation and the closed form."""
     report, _ = rut.experiment(2e-3)
@@ -92,6 +93,7 @@ def test_errors_are_exact_for_known_differences():
     assert figures["depth_error_mm"] == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_error_against_spacing_and_the_papers_case_are_measured():
     rows = rutbench.against_spacing(spacings=1)
     pairs = {(row["rule"], row["against"]) for row in rows}

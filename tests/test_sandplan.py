@@ -178,6 +178,7 @@ def test_bad_input(change, message):
         js.plan_sand(given.pop("scene"), given.pop("height"), given.pop("goal"), **given)
 
 
+@pytest.mark.slow
 def test_every_task_is_at_rest_and_has_something_to_do():
     for name in SAND_TASKS:
         task = sand_task(name)

@@ -15,7 +15,12 @@ from .test_settling import DX, rough
 
 SCHEMES = [js.Relaxation(), js.Pairwise(), js.SuperTimeStepping(), js.Multilevel(handover=16)]
 NEIGHBOURS = [4, 8, "isotropic"]
-CASES = [(s, n) for s in SCHEMES for n in NEIGHBOURS if not (isinstance(s, js.Pairwise) and n == "isotropic")]
+CASES = [
+    pytest.param(s, n, marks=pytest.mark.slow if isinstance(s, js.Multilevel) else ())
+    for s in SCHEMES
+    for n in NEIGHBOURS
+    if not (isinstance(s, js.Pairwise) and n == "isotropic")
+]
 
 
 def exact_sum(h):
@@ -90,6 +95,7 @@ def test_super_time_stepping_is_first_order_in_growth():
     assert np.polyfit(np.log(growths), np.log(errors), 1)[0] > 0.9
 
 
+@pytest.mark.slow
 def test_sweeps_grow_with_the_side_of_the_map_not_with_its_square():
     sides = np.array([32, 64, 128])
     for scheme, exponent in ((js.Relaxation(), 2.0), (js.SuperTimeStepping(), 1.0)):
@@ -97,6 +103,7 @@ def test_sweeps_grow_with_the_side_of_the_map_not_with_its_square():
         assert np.polyfit(np.log(sides), np.log(sweeps), 1)[0] == pytest.approx(exponent, abs=0.25)
 
 
+@pytest.mark.slow
 def test_multilevel_comes_close_and_closer_with_a_later_handover():
     h = column(64)
     scene = js.make_scene(h.shape, 1.0, ANGLE)
@@ -192,7 +199,10 @@ def test_schemes_that_do_not_fit_are_refused():
         js.make_scene((9, 9), DX, neighbours="round")
 
 
-@pytest.mark.parametrize(("scheme", "neighbours"), [(js.SuperTimeStepping(), "isotropic"), (js.Multilevel(4, 4), 8)])
+@pytest.mark.parametrize(
+    ("scheme", "neighbours"),
+    [(js.SuperTimeStepping(), "isotropic"), pytest.param(js.Multilevel(4, 4), 8, marks=pytest.mark.slow)],
+)
 def test_gradients_agree_with_differences(scheme, neighbours):
     h = rough((16, 16), "float64", seed=3)
     weight = rough((16, 16), "float64", seed=4)
@@ -218,6 +228,7 @@ def test_an_isotropic_pile_converges_to_the_cone():
     assert np.abs(piles.slopes(maps[2]) - 29).max() < 0.5
 
 
+@pytest.mark.slow
 def test_an_isotropic_pile_on_a_slope():
     errors = [piles.on_a_slope(33, 640), piles.on_a_slope(65, 2560)]
     assert errors[1] < 0.06
@@ -230,6 +241,7 @@ def test_an_isotropic_overfilled_table_drains_to_its_roof():
     assert errors[1] < 0.6 * errors[0]
 
 
+@pytest.mark.slow
 def test_in_one_dimension_isotropic_sand_is_that_of_four_neighbours():
     h = rough((1, 40), "float64")
     angles = np.linspace(0.3, 0.6, 40)[None]

@@ -47,6 +47,7 @@ def test_a_glyph_pushed_by_its_own_strokes_is_its_goal():
     assert np.allclose(result.strokes, task.place(goals.letter_strokes("K")))
 
 
+@pytest.mark.slow
 def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
     picture = np.zeros((20, 40))
     picture[4:16, 4:10] = -1

@@ -175,6 +175,7 @@ def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch)
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_goals_of_other_kinds():
     turned = turned_letters("I", 90)[0]
     np.testing.assert_allclose(turned.strokes, [[0.265, 0.16, 0.055, 0.16]], atol=1e-9)

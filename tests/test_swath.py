@@ -102,6 +102,7 @@ def loss(stroke, width, thickness, depth, angle, height):
     return jnp.sum(WEIGHTS * js.step(sand, height, stroke, push=FAST).height)
 
 
+@pytest.mark.slow
 def test_gradients():
     value, gradient = jax.jit(loss), jax.jit(jax.grad(loss, range(6)))
     forward = jax.jit(lambda x, v: jax.jvp(loss, x, v)[1])

@@ -24,6 +24,7 @@ PATH = np.array([[0.1, 0.12], [0.27, 0.12], [0.27, 0.27], [0.15, 0.18]])
 LIMIT = {"float32": 1e-6, "float64": 1e-14}  # of rough sand, whose heights are no whole quanta
 
 both = pytest.mark.parametrize("push", [STEPPED, SPLIT], ids=["stepped", "split"])
+heavy = pytest.mark.parametrize("push", [pytest.param(STEPPED, marks=pytest.mark.slow), SPLIT], ids=["stepped", "split"])
 
 
 def scene(slip=0.5, sinkage=0.015, grousers=None, shape=SHAPE, **parts):
@@ -191,7 +192,7 @@ def test_a_map_of_one_cell(push):
         assert np.array_equal(run(np.array(stroke)), [[0.0]])
 
 
-@pytest.fixture(scope="module", params=[STEPPED, SPLIT], ids=["stepped", "split"])
+@pytest.fixture(scope="module", params=[pytest.param(STEPPED, marks=pytest.mark.slow), SPLIT], ids=["stepped", "split"])
 def fenced(request):
     """Paths of four points on a map that drains and may hold walls, in float32: results, checked."""
     program = quick(lambda sand, h, path: js.follow(sand, h, path, push=request.param))
@@ -305,7 +306,7 @@ def test_grousers_fill_the_trench_in_one_go():
     assert np.array_equal(maps[-1], np.zeros(LONG[0]))  # of two piles alike nothing remains
 
 
-@both
+@heavy
 def test_vmap_and_batches_equal_a_loop(push):
     strokes = np.random.default_rng(5).uniform(0.05, 0.35, (3, 4)).astype(np.float32)
     maps = np.stack([rough("float32", k) for k in range(3)])

@@ -38,6 +38,7 @@ def moved(at, i, step):
     return (*at[:i], at[i] + step, *at[i + 1 :])
 
 
+@pytest.mark.slow
 def test_forward_derivatives_in_sub_steps():
     """Against central differences of 1e-8, to 1e-5 and 1e-6 (a gradient is some 10 long)."""
     f = partial(loss, STEPPED)

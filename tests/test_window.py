@@ -27,7 +27,7 @@ def test_equal_or_flagged():
     strokes = jnp.asarray(np.random.default_rng(0).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (12, 4)))
     whole = jax.vmap(lambda s: js.act(sand(), jnp.zeros(SHAPE), s).height)(strokes)
     exact = {}
-    for size in ((12, 12), (28, 28), (56, 56), (72, 80)):
+    for size in ((12, 12), (56, 56)):
         window = js.Window(size, tolerance=0.0)
         out = jax.vmap(lambda s, w=window: js.act(sand(w), jnp.zeros(SHAPE), s))(strokes)
         same = [bool(np.abs(a - b).max() < ROUNDING) for a, b in zip(out.height, whole, strict=True)]
@@ -37,7 +37,6 @@ def test_equal_or_flagged():
     assert exact[12, 12][1] >= 11  # too small: said
     assert exact[12, 12][0] < 6
     assert exact[56, 56] == (12, 0)  # large enough: the same maps
-    assert exact[72, 80] == (12, 0)
 
 
 def test_the_default_tolerance_keeps_the_difference_small():
@@ -76,6 +75,7 @@ def test_a_window_at_the_map_edge_with_everything_in_it():
     assert float(whole.drained) == pytest.approx(float(window.drained), rel=1e-9, abs=1e-15)
 
 
+@pytest.mark.slow
 def test_one_row_and_one_column():
     for shape, stroke in (
         ((1, 40), (0.1, 0.005, 0.3, 0.005)),
@@ -120,6 +120,7 @@ def test_settling_in_a_window_is_equal_or_flagged(scheme, neighbours):
     assert clean[2] == 24
 
 
+@pytest.mark.slow
 def test_a_window_in_a_window_drains_and_has_gradients():
     scene = js.make_scene(SHAPE, DX, ANGLE, edge=js.Draining(0.0))
     h = np.zeros(SHAPE)

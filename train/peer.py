@@ -1,6 +1,6 @@
 """Goals such as those of Kreis et al. 2025 (arXiv:2509.06469), rectangles, L shapes and polygons, dug by several methods.
 
-    python -m train.peer [--goals N] [--pushes N] [--seed K] [--json]
+    python -m train.peer [--goals N] [--strokes N] [--pushes N] [--seed K] [--json]
 
 A bed of 60 x 30 cells of 10 mm, 30 degrees; rectangles 40 to 60 mm wide and L shapes of 60 to 100 mm, 5 to 20 mm deep,
 polygons 10 to 30 mm deep. The blade here goes as deep as the goal. Their tool is another one, and what they average over is
@@ -28,7 +28,6 @@ from jaxsand.strokeloss import SandLoss
 from jaxsand.tool import Blade
 
 _SHAPE, _SPACING, _ANGLE = (30, 60), 0.01, math.radians(30)
-_STROKES = 12
 _CHANGED = 0.1  # of the goal's depth
 PUBLISHED = [
     {"method": "Kreis et al. 2025, as published", "mm": 3.4, "changed_percent": 97.0, "strokes": 23.5},
@@ -80,14 +79,14 @@ def _polygon(rng: np.random.Generator) -> np.ndarray:
     return rng.uniform(0.03, 0.07, 6)[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
 
 
-def methods(pushes: int, key: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
-    """What finds strokes [N, 4] (m), at most twelve; gradients and the search at a cost of about so many pushes."""
+def methods(most: int, pushes: int, key: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
+    """What finds strokes [N, 4] (m), at most so many; gradients and the search at a cost of about so many pushes."""
     policy = load_policy()
     return {
-        "policy, looking ahead": lambda s: plan_by_policy(policy, s, _STROKES, Stages(width=6)).strokes,
-        "the same, then gradients": lambda s: plan_by_policy(policy, s, _STROKES, Stages(6, pushes)).strokes,
-        "plan_sand": lambda s: plan_sand(s.scene, s.start, s.goal, strokes=_STROKES, budget=pushes, seed=key).strokes,
-        "optimise_strokes": lambda s: optimise_strokes(s.scene, s.goal, strokes=_STROKES, key=key, budget=pushes).strokes,
+        "policy, looking ahead": lambda s: plan_by_policy(policy, s, most, Stages(width=6)).strokes,
+        "the same, then gradients": lambda s: plan_by_policy(policy, s, most, Stages(6, pushes)).strokes,
+        "plan_sand": lambda s: plan_sand(s.scene, s.start, s.goal, strokes=most, budget=pushes, seed=key).strokes,
+        "optimise_strokes": lambda s: optimise_strokes(s.scene, s.goal, strokes=most, key=key, budget=pushes).strokes,
     }
 
 
@@ -104,11 +103,11 @@ def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:
     }
 
 
-def compare(number: int, pushes: int, key: int, tell: Callable[[str], None]) -> list[dict[str, Any]]:
+def compare(number: int, most: int, pushes: int, key: int, tell: Callable[[str], None]) -> list[dict[str, Any]]:
     """A row for each method, means over the goals, and the published figures."""
     goals = peer_goals(number, key)
     rows = []
-    for name, find in methods(pushes, key).items():
+    for name, find in methods(most, pushes, key).items():
         figures, began = [], time.perf_counter()
         for goal in goals:
             tell(f"{name}: {goal.name}")
@@ -125,6 +124,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = Parser(prog="python -m train.peer", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--goals", type=count, default=12, metavar="N", help="goals (12)")
     parser.add_argument(
+        "--strokes", type=count, default=24, metavar="N", help="at most so many (24, about as many as theirs)"
+    )
+    parser.add_argument(
         "--pushes", type=count, default=4000, metavar="N", help="pushes a goal for searches and gradients (4000)"
     )
     parser.add_argument("--seed", type=seed, default=0, metavar="K")
@@ -132,7 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def show() -> None:
-        rows = compare(options.goals, options.pushes, options.seed, progress())
+        rows = compare(options.goals, options.strokes, options.pushes, options.seed, progress())
         print(as_json({"rows": rows}) if options.json else "\n".join(as_table(rows, "method")))
 
     return ended(show)
