@@ -19,7 +19,7 @@ from jaxsand.bed import Bed, Lost, at, halo
 from jaxsand.flux import Around, flows
 from jaxsand.grid import links
 from jaxsand.loop import Plain, repeat, split
-from jaxsand.sweep import Flow, Sweep, apply, counted
+from jaxsand.sweep import Flow, counted, pass_over
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,7 @@ class Beside:
     tape: int = 1
 
     def __call__(self, params: Any, k: jax.Array, state: tuple[jax.Array, Lost]) -> tuple[jax.Array, Lost]:
-        h, lost = state
-        u, lost = repeat(Sweep(), self.sweeps, params, (halo(h), lost))
-        return at(u), lost
+        return repeat(_SWEEP, self.sweeps, params, state)
 
     def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
         return self(params, k, state), state
@@ -72,18 +70,23 @@ class Pulled:
 def surfaces(bed: Bed, flow: Flow, around: Around, sweeps: int, height: jax.Array) -> jax.Array:
     """The surface before each sweep."""
 
-    def surface(u: jax.Array) -> jax.Array:
-        return halo(around.surface(at(u)))
-
     def again(i: jax.Array, kept: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        u, tape = kept
-        s = surface(u)
-        moved = counted(flow, flows(bed, around.open, s))
-        return apply(bed, flow, moved, u, None)[0], lax.dynamic_update_index_in_dim(tape, at(s), i, 0)
+        h, tape = kept
+        tape = lax.dynamic_update_index_in_dim(tape, around.surface(h), i, 0)
+        return _sweep(bed, flow, around, h, None)[0], tape
 
     tape = jnp.zeros((sweeps, *height.shape), height.dtype)
-    u, tape = lax.fori_loop(0, sweeps - 1, again, (halo(height), tape))
-    return lax.dynamic_update_index_in_dim(tape, at(surface(u)), sweeps - 1, 0)
+    h, tape = lax.fori_loop(0, sweeps - 1, again, (height, tape))
+    return lax.dynamic_update_index_in_dim(tape, around.surface(h), sweeps - 1, 0)
+
+
+def _sweep(bed: Bed, flow: Flow, around: Around, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+    """One sweep of a map [H, W], which needs a halo only of its surface."""
+    moved = counted(flow, flows(bed, around.open, halo(around.surface(h))))
+    return pass_over(bed, flow, moved, h, lost)
+
+
+_SWEEP = Plain(lambda params, _, state: _sweep(*params, *state))
 
 
 def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.Array) -> Pulled:

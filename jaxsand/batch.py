@@ -120,8 +120,11 @@ def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int
 
 def cores() -> int:
     """How many cores there are to compute on; 1 where something else than a CPU does."""
-    if not _on_cpu():
-        return 1
+    return processors() if _on_cpu() else 1
+
+
+def processors() -> int:
+    """How many of the CPU's cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

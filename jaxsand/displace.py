@@ -63,20 +63,23 @@ def pass_on(
 ) -> tuple[jax.Array, Lost, jax.Array]:
     """Hands `carried` [H, W] on by one cell, the shares for the eight neighbours given; it rests where cells are `free`, or
     where there is room below a tool."""
+    cut = job.flow.quantum
     room = halo(jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype), 0.0)
     if job.bed.rim is not None:
         room = room + job.bed.rim.beyond
-    source = halo(carried, 0.0)
-    received, kept = jnp.zeros_like(h), carried
+    source = halo(carried / cut, 0.0)  # from here on in quanta
+    here = at(source)
+    received, kept = jnp.zeros_like(h), here
     for (di, dj), s in zip(EIGHT, share, strict=True):
-        given = whole(job, s * carried) * at(room, di, dj)
+        given = truncate(s * here) * at(room, di, dj)
         kept = kept - given
         s_there = at(halo(s, 0.0), -di, -dj) if s.ndim else s
-        received = received + whole(job, s_there * at(source, -di, -dj)) * at(room)
+        received = received + truncate(s_there * at(source, -di, -dj))
         if job.bed.rim is not None and lost is not None:
-            lost = lose(job.flow.quantum, lost, given * at(job.bed.rim.beyond, di, dj))
-    rest = whole(job, free.rest(h, received) if isinstance(free, Hanging) else free * received)
-    return h + (rest + kept), lost, received - rest
+            lost = lose(cut, lost, given * cut * at(job.bed.rim.beyond, di, dj))
+    received = received * at(room)
+    rest = truncate(free.rest(h, received * cut) / cut if isinstance(free, Hanging) else free * received)
+    return h + (rest + kept) * cut, lost, (received - rest) * cut
 
 
 def shares(p: jax.Array, q: jax.Array) -> Shares:

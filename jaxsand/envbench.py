@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import AxisType
+from jax.sharding import PartitionSpec as P
 
 from jaxsand.batch import wide_vectors
 from jaxsand.env import LevelGoals, OnSand, Together, Walks, make, pool_of
@@ -23,7 +25,7 @@ from jaxsand.window import Whole
 Tell = Callable[[str], None]
 Row = dict[str, Any]
 _FULL, _FAST, _MAP, _SAND = KINDS = "full push", "fast push", "walk on a map", "walk on sand"
-_VMAP, _LOOP = "vmap", "Gymnasium, one by one"
+_VMAP, _SHARED, _LOOP = "vmap", "vmap, a share to each device", "Gymnasium, one by one"
 _ROUNDS = 3
 _STEPS = 3  # of a batch to a round
 _ALONE = 32  # steps to a round of what makes them one by one
@@ -50,6 +52,8 @@ def bench_env(batch: int = 1024, tell: Tell = lambda _: None, kinds: tuple[str, 
         made[kind], options = _made(kind)
         many = max(1, batch // _SHARE) if kind == _SAND else batch
         ways.append(_vmapped(kind, _VMAP, made[kind], many))
+        if jax.local_device_count() > 1:
+            ways.append(_vmapped(kind, _SHARED, made[kind], many, jax.local_device_count()))
         if kind == _FULL:
             env, params = made[kind]
             scene = replace(params.scene, window=Whole())
@@ -77,22 +81,28 @@ def _made(kind: str) -> tuple[tuple[Any, Any], dict[str, Any]]:
     return make("single-stroke", **options), options
 
 
-def _vmapped(kind: str, name: str, made: tuple[Any, Any], batch: int) -> Contender:
-    """A few steps of a whole batch in one program, which draws the actions too."""
+def _vmapped(kind: str, name: str, made: tuple[Any, Any], batch: int, devices: int = 1) -> Contender:
+    """A few steps of a whole batch in one program, which draws the actions too; on several devices each has its share."""
     env, params = made
     space = env.action_space(params)
+    batch = -(-batch // devices) * devices
 
     def some(state: Any, key: jax.Array, params: Any) -> Any:
         def one(state: Any, key: jax.Array) -> Any:
-            own, draws = (jax.random.split(k, batch) for k in jax.random.split(key))
+            own, draws = (jax.random.split(k, batch // devices) for k in jax.random.split(key))
             _, state, reward, *_ = jax.vmap(env.step, (0, 0, 0, None))(own, state, jax.vmap(space.sample)(draws), params)
             return state, reward
 
-        return jax.lax.scan(one, state, jax.random.split(key, _STEPS))
+        return jax.lax.scan(one, state, jax.random.split(key[0], _STEPS))
 
+    if devices > 1:
+        mesh = jax.make_mesh((devices,), ("maps",), axis_types=(AxisType.Auto,))
+        share = (P("maps"), P("maps"), P())
+        some = jax.shard_map(some, mesh=mesh, in_specs=share, out_specs=(P("maps"), P(None, "maps")), check_vma=False)
     program = jax.jit(some, compiler_options=wide_vectors())
     _, state = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(1), batch), params)
-    return Contender(kind, name, batch, batch * _STEPS, lambda: program(state, jax.random.key(2), params))
+    keys = jax.random.split(jax.random.key(2), devices)
+    return Contender(kind, name, batch, batch * _STEPS, lambda: program(state, keys, params))
 
 
 def _without(kind: str, scene: Any, batch: int) -> Contender:

@@ -75,7 +75,7 @@ def stand(cover: jax.Array, bottom: jax.Array) -> Around:
     return Around(halo(free, 0.0), cover / jnp.maximum(free, NARROW), bottom)
 
 
-def fluxes(bed: Bed, around: Nothing | Around | Partial, u: jax.Array) -> Fluxes:
+def fluxes(bed: Bed, around: Nothing | Partial, u: jax.Array) -> Fluxes:
     """What flows over every link of a map with halo at rate 1 (m), towards its first cell; last what drains, if it does."""
     s, gate = (u, None) if isinstance(around, Nothing) else (halo(around.surface(at(u))), around.open)
     return flows(bed, gate, s)

@@ -9,7 +9,7 @@ from jax import lax
 
 from jaxsand import adjoint
 from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
-from jaxsand.flux import Around, Fluxes, Nothing, Partial, fluxes, gained
+from jaxsand.flux import Fluxes, Nothing, Partial, fluxes, gained
 from jaxsand.loop import Plain, split
 
 
@@ -22,7 +22,7 @@ class Flow:
     quantum: jax.Array
 
 
-def sweep(bed: Bed, flow: Flow, around: Nothing | Around | Partial, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
     """One sweep of a map with halo [H + 2, W + 2].
 
     `lost` gathers the height that left each cell over a draining rim (see `lose`); None where nothing drains.
@@ -37,7 +37,7 @@ def counted(flow: Flow, driven: Fluxes) -> Fluxes:
 
 
 def surge(
-    bed: Bed, flow: Flow, momentum: jax.Array, around: Nothing | Around | Partial, state: tuple[jax.Array, Lost, Fluxes]
+    bed: Bed, flow: Flow, momentum: jax.Array, around: Nothing | Partial, state: tuple[jax.Array, Lost, Fluxes]
 ) -> tuple[jax.Array, Lost, Fluxes]:
     """A sweep that also repeats the share `momentum` of what each link moved in the last one (quanta)."""
     u, lost, last = state
@@ -49,10 +49,16 @@ def surge(
 
 
 def apply(bed: Bed, flow: Flow, moved: Fluxes, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """The map after whole quanta `moved` over its links; stored ones, lest each end compute its own."""
+    """The map with halo after whole quanta `moved` over its links; stored ones, lest each end compute its own."""
+    h, lost = pass_over(bed, flow, moved, at(u), lost)
+    return halo(h), lost
+
+
+def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+    """`apply` to a map [H, W] without halo."""
     if lost is not None:
         lost = lose(flow.quantum, lost, moved[-1] * flow.quantum)
-    return halo(at(u) + gained(bed, moved) * flow.quantum), lost
+    return h + gained(bed, moved) * flow.quantum, lost
 
 
 class Sweep(Plain):
@@ -64,7 +70,7 @@ class Sweep(Plain):
     def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
         """By hand where sand flows in pairs: from the heights, which tell the links that were active."""
         bed, flow, around = params
-        if bed.neighbours == "isotropic" or bed.rim is not None or isinstance(around, Around):
+        if bed.neighbours == "isotropic" or bed.rim is not None:
             return super().pull(params, k, record, cotangent)
         h, gain = at(record[0]), at(cotangent[0])
         s = record[0] if isinstance(around, Nothing) else halo(around.surface(h))

@@ -1,6 +1,7 @@
 """`jaxsand bench`: error against run time, and speed beside rivals."""
 
 import argparse
+from contextlib import suppress
 from typing import Any
 
 from jaxsand.commands.printing import show
@@ -10,6 +11,8 @@ from jaxsand.files import as_json, folder, progress, written
 def run_benchmark(options: argparse.Namespace) -> None:
     tell = progress()
     out = folder(options.out) if options.out else None
+    if options.what in ("env", "all"):
+        _device_for_each_core()
     from jaxsand.benchmark import bench, table
 
     strokes = _of_strokes(options)
@@ -44,6 +47,16 @@ def run_benchmark(options: argparse.Namespace) -> None:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     show(options, report, table)
+
+
+def _device_for_each_core() -> None:
+    """As the README has it for batches of environments; too late once JAX has begun to compute."""
+    import jax
+
+    from jaxsand.batch import processors
+
+    with suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", processors())
 
 
 def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Pushes inside an environment, one map or many.
 
 A vmapped push takes as long as the longest of its strokes. `ByLength` therefore tells vmap to sort a batch by the strokes'
-lengths and to push chunk after chunk of like ones, each small enough for a core's cache, in parts that the device may work
-on at the same time. A map comes out as it would alone, up to rounding.
+lengths and to push chunk after chunk of like ones, each small enough for a core's cache. A map comes out as it would alone,
+up to rounding. On several cores of a CPU, give each a device of its own and a share of the batch (see the README).
 """
 
 from collections.abc import Callable
@@ -36,11 +36,9 @@ class Together:
 
 @dataclass(frozen=True)
 class ByLength:
-    """A batch is pushed in chunks of maps with strokes of like length, in so many `parts` beside each other: what suits a
-    CPU's cores. Has no reverse mode."""
+    """A batch is pushed in chunks of maps with strokes of like length: what suits a CPU. Has no reverse mode."""
 
     chunk: int = 32
-    parts: int = 2
 
     def pushing(self, push: Push, stop: Stop | None) -> Pushing:
         return sorted_by_length(self, _alone(push, stop))
@@ -70,8 +68,8 @@ def sorted_by_length(way: ByLength, alone: Pushing) -> Pushing:
         stroke = jnp.asarray(of_one[2])
         length = jnp.hypot(stroke[..., 2] - stroke[..., 0], stroke[..., 3] - stroke[..., 1])
         order = jnp.argsort(jnp.broadcast_to(-length, (size,)))
-        chunk = min(way.chunk, -(-size // way.parts))
-        chunks = -(-size // (chunk * way.parts)) * way.parts
+        chunk = min(way.chunk, size)
+        chunks = -(-size // chunk)
         filled = jnp.concatenate([order, jnp.repeat(order[-1:], chunk * chunks - size)]).reshape(chunks, chunk)
 
         def pushed(who: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -79,8 +77,7 @@ def sorted_by_length(way: ByLength, alone: Pushing) -> Pushing:
             axes = jax.tree.unflatten(tree, [0 if m else None for m in mapped])
             return jax.vmap(alone, in_axes=axes)(*jax.tree.unflatten(tree, some))
 
-        parts = [lax.map(pushed, filled[k :: way.parts]) for k in range(way.parts)]
-        out = jax.tree.map(lambda *x: jnp.stack(x, 1).reshape(chunks * chunk, *x[0].shape[2:])[:size], *parts)
+        out = jax.tree.map(lambda x: x.reshape(chunks * chunk, *x.shape[2:])[:size], lax.map(pushed, filled))
         return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x, unique_indices=True), out), (True, True)
 
     return one
