@@ -26,13 +26,15 @@ def usual_scene() -> Scene:
 
 @dataclass(frozen=True)
 class StrokeGoal:
-    """What `strokes` [N, 4] (m) leave of `start` [H, W] (m); a search is told the start, the goal and N."""
+    """What `strokes` [N, 4] (m) leave of `start` [H, W] (m); a search is told the start, the goal and N. `size` (m) is that
+    of the square they were drawn in."""
 
     name: str
     scene: Scene
     start: np.ndarray
     goal: np.ndarray
     strokes: np.ndarray
+    size: float = task.GLYPH_SQUARE[1] - task.GLYPH_SQUARE[0]
 
     @property
     def sand(self) -> SandLoss:

@@ -47,7 +47,7 @@ def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:
         "l2_reduction": float(task.l2_reduction(goal, level, dug)),
         "right": right(goal, dug, glyph.depth),
         "strict": strict(goal, level, dug, glyph.depth),
-        "strokes_right": strokes_right(glyph.strokes, pushes),
+        "strokes_right": strokes_right(glyph.strokes, pushes, glyph.size),
         "strokes": len(glyph.strokes),
         "pushes": [[round(float(v), 6) for v in push] for push in pushes],
     }

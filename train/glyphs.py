@@ -4,6 +4,7 @@ import json
 import math
 import string
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,8 @@ def _moved(scale: float, shift: float) -> list[StrokeGoal]:
     for name in string.ascii_uppercase:
         angle = rng.uniform(0, 2 * math.pi)
         away = 0.5 + shift * np.array([math.cos(angle), math.sin(angle)] * 2)
-        out.append(stroke_goal(name, task.place((goals.letter_strokes(name) - 0.5) * scale + away)))
+        moved = stroke_goal(name, task.place((goals.letter_strokes(name) - 0.5) * scale + away))
+        out.append(replace(moved, size=scale * moved.size))
     return out
 
 
