@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType
+from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from jaxsand.batch import wide_vectors
@@ -102,6 +102,8 @@ def _vmapped(kind: str, name: str, made: tuple[Any, Any], batch: int, devices: i
     program = jax.jit(some, compiler_options=wide_vectors())
     _, state = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(1), batch), params)
     keys = jax.random.split(jax.random.key(2), devices)
+    if devices > 1:
+        state, keys = jax.device_put((state, keys), NamedSharding(mesh, P("maps")))
     return Contender(kind, name, batch, batch * _STEPS, lambda: program(state, keys, params))
 
 

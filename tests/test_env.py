@@ -267,9 +267,9 @@ def test_the_angle_of_repose_may_differ_from_one_environment_to_the_next():
     assert len(np.unique(np.asarray(many[2]).round(4))) == 5
 
 
-@pytest.mark.parametrize(("size", "chunk"), [(7, 2), pytest.param(1, 4, marks=SLOW), pytest.param(5, 8, marks=SLOW)])
+@pytest.mark.parametrize(("size", "chunk"), [(7, 2), (1, 4), (5, 8)])
 def test_sorting_a_batch_changes_no_map(size, chunk):
-    """Whatever is numpy's and whatever is batched; the angles test does it with a real push."""
+    """Whatever is numpy's and whatever is batched; the next test does it with a real push."""
 
     def push(scene, height, stroke):
         return height * stroke[0] + scene["angle"], stroke[2:].astype(int).sum()
@@ -293,6 +293,19 @@ def test_only_what_is_dug_counts_for_drawn_goals():
         env, params = small(goals=drawn, measure=measure)
         _, state = env.reset(KEY, params)
         assert float(env.distance(replace(state, height=berms), params)) == pytest.approx(far)
+
+
+def test_a_batch_by_length_is_its_maps():
+    push = ByLength(2).pushing(QUICK, js.Sweeps(8))
+    rng = np.random.default_rng(1)
+    strokes, maps = rng.uniform(0.02, 0.14, (5, 4)).astype("float32"), np.zeros((5, 16, 16), "float32")
+    many, outcome = jax.jit(jax.vmap(push, (None, 0, 0)))(SMALL, maps, strokes)
+    assert len({round(float(h.min()), 5) for h in many}) > 1
+    alone = jax.jit(push)
+    for i in range(5):
+        height, code = alone(SMALL, maps[i], strokes[i])
+        np.testing.assert_allclose(many[i], height, atol=2e-6)
+        assert int(code) == int(outcome[i])
 
 
 def test_the_fast_push_digs_too():
@@ -348,6 +361,30 @@ def test_spaces_know_what_belongs_to_them():
         (lambda: small(goals=[np.zeros((16, 16))]), "^goals: got list; give RandomStrokes"),
         (lambda: small(starts="rough"), "^starts: got 'rough'; give Level"),
         (lambda: small(goals={"x": []}), "^goals: got a glyph without strokes"),
+        (lambda: small(goals={"x": [[0, 0, 1, 1], [0]]}), "^goals: got a glyph without strokes, 'x'; give names"),
+        (lambda: small(goals=np.array([[["a"]]])), "^goals: got <U1; give one or more maps"),
+        (
+            lambda: small(goals=envs.LevelGoals(jnp.zeros((1, 5, 5)))),
+            r"^goals: got maps of \[5, 5\], the scene has \[16, 16\]",
+        ),
+        (
+            lambda: small(goals=envs.LevelGoals(jnp.zeros((1, 16, 16))), starts=envs.Level()),
+            "^starts: got Level.*leave it out",
+        ),
+        (lambda: small(push="fast"), r"^push: got 'fast'; give one of SteppedPush\(\.\.\.\), SwathPush"),
+        (lambda: small(stop=True), r"^stop: got True; give one of NoStop"),
+        (lambda: small(batching=ByLength), r"^batching: got <class.*; give one of Together\(\.\.\.\), ByLength"),
+        (lambda: small(settle=0.1), "^settle: got 0.1; give one of UntilStill.*None"),
+        (lambda: small(limit=0), "^limit: got 0; give 1 step or more"),
+        (lambda: small(limit="a"), "^limit: got 'a'; give 1 step or more"),
+        (lambda: small(seed=-1), "^seed: got -1; give a whole number"),
+        (lambda: small(scene="x"), "^scene: got 'x'; give make_scene"),
+        (lambda: small(scene=js.make_scene((16, 16), 0.01)), "^scene.tool: got NoTool"),
+        (lambda: js.make("single-stroke", on="sand"), r"^on: got 'sand'; give one of OnMap\(\.\.\.\), OnSand"),
+        (lambda: js.make("single-stroke", goals="letters"), r"^goals: got 'letters'; give one of MapPool"),
+        (lambda: js.make("single-stroke", limit=-3), "^limit: got -3"),
+        (lambda: ByLength(0), "^chunk: got 0; give a whole number of at least 1"),
+        (lambda: small(starts=envs.Rough(np.inf)), "^starts: got Rough"),
         (lambda: small(goals=envs.RandomStrokes(fewest=3, most=2)), "^goals: got RandomStrokes.*fewest <= most"),
         (lambda: small(starts=envs.Rough(-1.0)), "^starts: got Rough"),
         (lambda: one_map(np.eye(2, dtype=bool)), "^map: got 2 pieces"),

@@ -1,9 +1,32 @@
 """The bench of the environments, at a small size."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from jaxsand.benchmark import table
 from jaxsand.envbench import KINDS, bench_env
+
+
+def test_a_device_for_each_core_has_its_row():
+    code = """
+from jaxsand.envbench import bench_env
+print(*(f"{row['name']};{row['batch']};{row['steps_per_second'] > 0}" for row in bench_env(7, kinds=("walk on a map",))), sep="\\n")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"JAX_NUM_CPU_DEVICES": "2"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.splitlines() == [
+        "vmap;7;True",
+        "vmap, a share to each device;8;True",
+        "Gymnasium, one by one;1;True",
+    ]
 
 
 @pytest.mark.parametrize("kinds", [("fast push", "walk on a map"), pytest.param(KINDS, marks=pytest.mark.slow)])

@@ -1,8 +1,11 @@
 """The peer's goals and figures, at known answers; and that every method there digs."""
 
+import json
+
 import numpy as np
 import pytest
 
+from train import peer
 from train.peer import PUBLISHED, compare, judged, peer_goals
 
 
@@ -35,6 +38,16 @@ def test_figures_at_known_answers():
     assert half == pytest.approx(
         {"mm": depth / 2, "before_mm": depth, "changed_percent": 100, "bed_mm": depth * share / 2}, rel=1e-5
     )
+
+
+def test_the_command_gives_its_options_and_prints_the_figures(monkeypatch, capsys):
+    given = []
+    monkeypatch.setattr(peer, "compare", lambda *options: given.append(options[:4]) or PUBLISHED)
+    assert peer.main(["--goals", "3", "--strokes", "5", "--pushes", "70", "--seed", "2", "--json"]) == 0
+    assert given == [(3, 5, 70, 2)]
+    assert json.loads(capsys.readouterr().out) == {"rows": PUBLISHED}
+    assert peer.main(["--strokes", "1000"]) == 2
+    assert "strokes: got 1000; give at most 100" in capsys.readouterr().err
 
 
 @pytest.mark.slow

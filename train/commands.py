@@ -56,7 +56,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
     """How many glyphs, or letter maps, a run's best state gets right."""
     tell = progress()
     tell("getting ready")
-    out = options.out
+    out = folder(options.out) if options.out else None
     if options.run == "pretrained":
         from jaxsand.policy import load_policy
 
@@ -71,7 +71,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
         else:
             report = _on_sand(learner.policy(state), options, tell, out)
     if out:
-        with written(folder(out) / "evaluate.json") as path:
+        with written(out / "evaluate.json") as path:
             path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     show(options, report, _evaluated)

@@ -36,11 +36,12 @@ def curve(run: Path) -> dict[str, np.ndarray]:
                 points.append((row["seconds"] / 60, done, row["score"]))
             else:
                 done += next(row[name] for name in _COUNTS if name in row)
+        figures = np.array(points, float)
     except (ValueError, KeyError, TypeError, StopIteration) as error:
         raise ValueError(f"run: cannot read {file} ({type(error).__name__}); give folders of runs of this version") from None
     if not points:
         raise ValueError(f"run: {run} holds no validation yet; train it on with --resume")
-    return dict(zip(("minutes", "simulated", "score"), np.array(points).T, strict=True))
+    return dict(zip(("minutes", "simulated", "score"), figures.T, strict=True))
 
 
 def curves_figure(curves: dict[str, dict[str, np.ndarray]]) -> "Figure":

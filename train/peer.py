@@ -21,6 +21,7 @@ from jaxsand.commands.arguments import Parser, count, ended, seed
 from jaxsand.files import as_json, as_table, progress
 from jaxsand.optimise import optimise_strokes
 from jaxsand.policy import load_policy
+from jaxsand.rules import check_whole
 from jaxsand.sandplan import plan_sand
 from jaxsand.scene import Scene, make_scene
 from jaxsand.stages import Stages, plan_by_policy
@@ -134,6 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def show() -> None:
+        check_whole("strokes", options.strokes, 1, 100)
         rows = compare(options.goals, options.strokes, options.pushes, options.seed, progress())
         print(as_json({"rows": rows}) if options.json else "\n".join(as_table(rows, "method")))
 

@@ -195,6 +195,8 @@ def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State,
     folder(out)
     if there:
         _compare(_config(out), described(learner), seed, out)
+    if not (out / _LAST).exists() and (out / _BEST).exists():
+        raise ValueError(f"out: the run in {out} has lost {_LAST}; put it back, or begin anew in another folder")
     state = learner.init(seed)  # what cannot begin leaves no run
     if not there:
         versions = {name: metadata.version(name) for name in _PACKAGES} | {"python": platform.python_version()}

@@ -11,7 +11,7 @@ from jaxsand.files import as_json, folder, progress, written
 def run_benchmark(options: argparse.Namespace) -> None:
     tell = progress()
     out = folder(options.out) if options.out else None
-    if options.what in ("env", "all"):
+    if options.what == "env":
         _device_for_each_core()
     from jaxsand.benchmark import bench, table
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 def run_shape(options: argparse.Namespace) -> None:
+    _check_options(options)
     tell = progress()
     started = time.perf_counter()
     tell("reading the goal")
@@ -28,7 +29,6 @@ def run_shape(options: argparse.Namespace) -> None:
 
     began = time.perf_counter()
     looks = options.method in ("search", "optimise", "policy")
-    _check_options(options)
     target = _target(options)
     if looks and target.drawn:
         raise ValueError(

@@ -6,6 +6,7 @@ The state of an episode is apart from the parameters, whose leaves may be vmappe
 from dataclasses import fields
 from typing import Any
 
+from jaxsand.env.checks import check_kinds, check_limit, check_ready_goals, check_scene
 from jaxsand.env.library import Level, RandomStrokes, Rough, library
 from jaxsand.env.maps import MapPool, Walks, map_pool, pool_of
 from jaxsand.env.multi import (
@@ -24,6 +25,7 @@ from jaxsand.env.onsand import OnSand, SandParams, SandState
 from jaxsand.env.pushing import ByLength, Together
 from jaxsand.env.spaces import Box, Dict, Discrete
 from jaxsand.push import SteppedPush
+from jaxsand.rules import check_whole
 from jaxsand.scene import Scene, make_scene
 from jaxsand.tool import Blade
 from jaxsand.window import Whole, Window
@@ -94,6 +96,8 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
 def _single(on: OnMap | OnSand | None = None, scene: Scene | None = None, **params: Any) -> tuple[Any, Any]:
     env = OnMap() if on is None else on
     _known("single-stroke", params, fields(MapParams))
+    check_kinds({"on": env, **params})
+    check_limit(params)
     if isinstance(env, OnMap):
         if scene is not None:
             raise ValueError("scene: has no effect on a binary map; leave it out, or give on=OnSand()")
@@ -101,6 +105,7 @@ def _single(on: OnMap | OnSand | None = None, scene: Scene | None = None, **para
     layout = env.layout
     rows, columns = (n * layout.cell + 2 * layout.margin for n in env.shape)
     scene = make_scene((rows, columns), layout.spacing, tool=layout.blade) if scene is None else scene
+    check_scene(scene)
     if scene.grid.shape != (rows, columns):
         raise ValueError(
             f"scene: got {list(scene.grid.shape)} cells, the layout takes [{rows}, {columns}]; make it as large"
@@ -112,13 +117,19 @@ def _multi(
     goals: Any = None, starts: Level | Rough | None = None, scene: Scene | None = None, seed: int = 0, **options: Any
 ) -> tuple[Any, Any]:
     own = {f.name for f in fields(MultiStroke)}
+    check_kinds({key: value for key, value in options.items() if key in own})
     env = MultiStroke(**{key: value for key, value in options.items() if key in own})
     params = {key: value for key, value in options.items() if key not in own}
     _known("multi-stroke", params, (f for f in fields(StrokeParams) if f.name == "limit"))
+    check_limit(params)
+    check_whole("seed", seed, 0)
     if scene is None:
         window = Window(_WINDOW) if isinstance(env.push, SteppedPush) else Whole()
         scene = make_scene(_SHAPE, _SPACING, tool=Blade(), window=window)
-    if not isinstance(goals, LevelGoals | RoughGoals):
+    check_scene(scene)
+    if isinstance(goals, LevelGoals | RoughGoals):
+        check_ready_goals(scene, goals, starts)
+    else:
         goals = library(env, scene, RandomStrokes() if goals is None else goals, Level() if starts is None else starts, seed)
     return env, StrokeParams(scene, goals, **params)
 

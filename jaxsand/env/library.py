@@ -73,17 +73,18 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
         goals = np.asarray(goals)
     rng = np.random.default_rng(seed)
     if isinstance(goals, np.ndarray):
-        if goals.ndim != 3 or not len(goals):
-            raise ValueError(f"goals: got shape {list(goals.shape)}; give one or more maps [G, H, W] in metres")
+        if goals.ndim != 3 or not len(goals) or goals.dtype.kind not in "fiub":
+            what = f"shape {list(goals.shape)}" if goals.dtype.kind in "fiub" else f"{goals.dtype}"
+            raise ValueError(f"goals: got {what}; give one or more maps [G, H, W] in metres")
         task.fits(scene, goals[0], "goals")
         task.finite(goals, "goals")
         plans, count = [], len(goals)
     elif not isinstance(goals, RandomStrokes | Mapping):
         raise ValueError(f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, or maps [G, H, W]")
     else:
-        plans = goals.plans(rng) if isinstance(goals, RandomStrokes) else [np.asarray(s, float) for s in goals.values()]
-        if not plans or any(some.ndim != 2 or some.shape[1] != 4 or not len(some) for some in plans):
-            raise ValueError("goals: got a glyph without strokes; give names with strokes [[x0, y0, x1, y1], ...]")
+        plans = goals.plans(rng) if isinstance(goals, RandomStrokes) else [_strokes(name, goals[name]) for name in goals]
+        if not plans:
+            raise ValueError("goals: got no glyph; give names with strokes [[x0, y0, x1, y1], ...]")
         count = len(plans)
     before = _surfaces(scene, starts, count, rng)
     after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans)
@@ -92,12 +93,23 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
     return RoughGoals(jnp.asarray(after), jnp.asarray(before))
 
 
+def _strokes(name: Any, strokes: Any) -> np.ndarray:
+    """The strokes [n, 4] of one glyph."""
+    try:
+        found = np.asarray(strokes, float)
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.ndim != 2 or found.shape[1] != 4 or not len(found) or not np.all(np.isfinite(found)):
+        raise ValueError(f"goals: got a glyph without strokes, {name!r}; give names with strokes [[x0, y0, x1, y1], ...]")
+    return found
+
+
 def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Generator) -> np.ndarray:
     """Maps [count, H, W] (m) at rest."""
     shape = (count, *scene.grid.shape)
     if isinstance(starts, Level):
         return np.zeros(shape, np.float32)
-    if not (starts.relief >= 0 and starts.scale > 0):
+    if not (0 <= starts.relief < np.inf and 0 < starts.scale < np.inf):
         raise ValueError(f"starts: got {starts}; give a relief of 0 m or more, and a scale above 0 cells")
     noise = gaussian_filter(rng.normal(size=shape), (0, starts.scale, starts.scale), mode="reflect")
     noise -= noise.mean((1, 2), keepdims=True)

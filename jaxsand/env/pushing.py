@@ -16,7 +16,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from jaxsand.push import SteppedPush
-from jaxsand.rules import Stop
+from jaxsand.rules import Stop, check_whole
 from jaxsand.scene import Scene
 from jaxsand.sim import step
 from jaxsand.swath import SwathPush
@@ -39,6 +39,9 @@ class ByLength:
     """A batch is pushed in chunks of maps with strokes of like length: what suits a CPU. Has no reverse mode."""
 
     chunk: int = 32
+
+    def __post_init__(self) -> None:
+        check_whole("chunk", self.chunk, 1)
 
     def pushing(self, push: Push, stop: Stop | None) -> Pushing:
         return sorted_by_length(self, _alone(push, stop))

@@ -1,0 +1,55 @@
+"""What `make` is given, looked at before anything is computed from it."""
+
+from typing import Any, get_args
+
+import numpy as np
+
+from jaxsand.env.maps import MapGoals
+from jaxsand.env.multi import LevelGoals, NoStop, OnlyDug, RoughGoals, Stop, WithBerms
+from jaxsand.env.onmap import OnMap
+from jaxsand.env.onsand import OnSand
+from jaxsand.env.pushing import Batching, Push
+from jaxsand.rules import Stop as StopRule
+from jaxsand.scene import Scene, blade_of, concrete
+
+_KINDS: dict[str, Any] = {
+    "on": OnMap | OnSand,
+    "push": Push,
+    "stop": NoStop | Stop,
+    "measure": WithBerms | OnlyDug,
+    "batching": Batching,
+    "settle": StopRule | None,
+    "goals": MapGoals,
+}
+
+
+def check_kinds(options: dict[str, Any]) -> None:
+    """Raises ValueError for an option that is none of the kinds there are."""
+    for name, value in options.items():
+        kind = _KINDS.get(name)
+        if kind is not None and not isinstance(value, kind):
+            kinds = ", ".join("None" if k is type(None) else f"{k.__name__}(...)" for k in get_args(kind))
+            raise ValueError(f"{name}: got {value!r:.60}; give one of {kinds}")
+
+
+def check_limit(options: dict[str, Any]) -> None:
+    """Raises ValueError for a limit below one; a traced one is let through."""
+    if "limit" in options:
+        limit = concrete(options["limit"])
+        if limit is not None and not np.all(limit >= 1):
+            raise ValueError(f"limit: got {options['limit']!r}; give 1 step or more to an episode")
+
+
+def check_scene(scene: Any) -> None:
+    """Raises ValueError unless it is a scene whose tool is a blade."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene: got {scene!r:.60}; give make_scene(..., tool=Blade())")
+    blade_of(scene)
+
+
+def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: Any) -> None:
+    """Raises ValueError for maps of another shape than the scene's, and for starts that they would not begin from."""
+    if goals.goals.shape[-2:] != scene.grid.shape:
+        raise ValueError(f"goals: got maps of {list(goals.goals.shape[-2:])}, the scene has {list(scene.grid.shape)} cells")
+    if starts is not None:
+        raise ValueError(f"starts: got {starts!r} beside goals that are ready; leave it out, or give strokes as goals")
