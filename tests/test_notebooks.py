@@ -21,6 +21,10 @@ FULL, SMALL = 'SIZE = "full"\n', 'SIZE = "small"\n'
 LARGEST = 300_000  # bytes
 
 
+def case(path, marks=()):
+    return pytest.param(path, id=path.stem, marks=marks)
+
+
 def sources(notebook):
     """The code of every code cell, by its id."""
     cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
@@ -112,7 +116,9 @@ CHECKS = {"settling": settling, "planning": planning, "wheel": wheel, "strokes":
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")  # plt.show() where there is a display
-@pytest.mark.parametrize("notebook", NOTEBOOKS or [NONE], ids=lambda path: path.stem if path else "none")
+@pytest.mark.parametrize(
+    "notebook", [case(path, () if path.stem == "settling" else pytest.mark.slow) for path in NOTEBOOKS] or [NONE]
+)
 def test_a_notebook_runs_and_says_what_is_so(notebook):
     cells = sources(notebook)
     assert sum(f"{source}\n".count(FULL) for source in cells.values()) == 1
@@ -131,7 +137,7 @@ def test_a_notebook_runs_and_says_what_is_so(notebook):
         CHECKS[notebook.stem](names)
 
 
-@pytest.mark.parametrize("notebook", NOTEBOOKS or [NONE], ids=lambda path: path.stem if path else "none")
+@pytest.mark.parametrize("notebook", [case(path) for path in NOTEBOOKS] or [NONE])
 def test_a_notebook_is_small_and_clean(notebook):
     """No outputs that a run could contradict; ids for every cell."""
     assert notebook.stat().st_size < LARGEST
