@@ -60,7 +60,7 @@ INSIDE = {
     ],
     "sandplan": [{"actions", "reach"}, {"rollouts", "binary"}, {"strokes", "steps", "tasks"}, {"rivals"}],
     "optimise": [{"account", "sketch"}, {"moves"}],
-    "env": [{"spaces", "episode", "maps", "pushing"}, {"onmap", "multi"}, {"onsand", "library"}],
+    "env": [{"spaces", "episode", "maps", "pushing"}, {"onmap", "multi"}, {"onsand", "library"}, {"checks"}],
     "commands": [{"printing", "arguments"}, {"shape", "settle", "plan", "trench", "bench"}],
 }
 HEAVY = {"matplotlib": {"render", "rutfigures", "strokefigures", "goals"}, "PIL": {"render", "goals"}}

@@ -93,8 +93,9 @@ def run(
     if minutes is None and steps is None:
         raise ValueError("minutes: got none, and no steps; give one of them")
     tell = tell or progress()
+    began = time.monotonic()
     state, at = _begin(learner, out, seed, resume)
-    started = time.monotonic() - at.seconds
+    started = began - at.seconds
 
     def spent() -> float:
         return time.monotonic() - started
