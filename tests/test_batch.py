@@ -40,7 +40,11 @@ def test_a_batch_is_its_maps(scheme, edge, dtype):
     same(js.settle_batch(scene, h, scheme=scheme, chunk=8), alone)
 
 
-@pytest.mark.parametrize(("chunk", "many"), [(None, 37), (1, 2), (1, 7), (5, 1), (5, 37), (64, 7)])
+CUTS = [(None, 37), (1, 2), (1, 7), (5, 1), (5, 37), (64, 7)]
+OTHERS = [(chunk, many) for chunk in (None, 1, 5, 64) for many in (1, 2, 7, 37) if (chunk, many) not in CUTS]
+
+
+@pytest.mark.parametrize(("chunk", "many"), [*CUTS, *(pytest.param(*cut, marks=pytest.mark.slow) for cut in OTHERS)])
 def test_however_it_is_cut_up(many, chunk, monkeypatch):
     scene, h = js.make_scene(SHAPE, DX, ANGLE), maps("float32")[:many]
     whole = js.settle_batch(scene, h, chunk=64)

@@ -117,8 +117,9 @@ def _multi(
     goals: Any = None, starts: Level | Rough | None = None, scene: Scene | None = None, seed: int = 0, **options: Any
 ) -> tuple[Any, Any]:
     own = {f.name for f in fields(MultiStroke)}
-    check_kinds({key: value for key, value in options.items() if key in own})
-    env = MultiStroke(**{key: value for key, value in options.items() if key in own})
+    chosen = {key: value for key, value in options.items() if key in own}
+    check_kinds(chosen)
+    env = MultiStroke(**chosen)
     params = {key: value for key, value in options.items() if key not in own}
     _known("multi-stroke", params, (f for f in fields(StrokeParams) if f.name == "limit"))
     check_limit(params)

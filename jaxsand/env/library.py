@@ -97,7 +97,7 @@ def _strokes(name: Any, strokes: Any) -> np.ndarray:
     """The strokes [n, 4] of one glyph."""
     try:
         found = np.asarray(strokes, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.empty(0)
     if found.ndim != 2 or found.shape[1] != 4 or not len(found) or not np.all(np.isfinite(found)):
         raise ValueError(f"goals: got a glyph without strokes, {name!r}; give names with strokes [[x0, y0, x1, y1], ...]")
