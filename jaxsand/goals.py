@@ -1,6 +1,7 @@
 """Goals and surfaces from real input: letters, text maps, images, height maps, terrain. Host side, numpy only."""
 
 import json
+import math
 import string
 from functools import cache
 from importlib import resources
@@ -18,6 +19,23 @@ def letter_strokes(letter: str) -> np.ndarray:
     if letter not in table:
         raise ValueError(f"letter: got {letter!r}; give one of {string.ascii_uppercase}")
     return np.array(table[letter], float)
+
+
+def stroke_list(field: str, name: object, strokes: Any, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
+    """The strokes [n, 4] of a glyph that a user gave.
+
+    Raises:
+      ValueError: names the field and the glyph, unless there is a stroke or more, of finite numbers from `low` to `high`.
+    """
+    try:
+        found = np.array(strokes, float)
+    except (TypeError, ValueError, OverflowError):
+        found = np.empty(0)
+    good = found.ndim == 2 and found.shape[1] == 4 and len(found) and np.all(np.isfinite(found))
+    if not good or found.min() < low or found.max() > high:
+        numbers = "finite numbers" if math.isinf(low) else f"from {low:g} to {high:g}"
+        raise ValueError(f"{field}: {name!r:.60} has no list of strokes; give some [x0, y0, x1, y1], {numbers}, y up")
+    return found
 
 
 def letter_map(letter: str) -> tuple[np.ndarray, Cell]:

@@ -6,7 +6,6 @@ import string
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -32,18 +31,9 @@ def read_glyphs(path: Path) -> list[StrokeGoal]:
         raise ValueError(f"glyphs: cannot read {path} ({why}); give a JSON file of names and strokes") from None
     if not isinstance(table, dict) or not table:
         raise ValueError(f"glyphs: got no glyph in {path}; give a JSON object of names and strokes")
-    return [stroke_goal(name, task.place(_strokes(name, strokes))) for name, strokes in table.items()]
-
-
-def _strokes(name: str, strokes: Any) -> np.ndarray:
-    try:
-        array = np.array(strokes, float)
-        good = array.ndim == 2 and array.shape[1] == 4 and len(array) and np.all((array >= 0) & (array <= 1))
-    except (TypeError, ValueError, OverflowError):
-        good = False
-    if not good:
-        raise ValueError(f"glyphs: {name!r} has no list of strokes [x0, y0, x1, y1] from 0 to 1; give some, y goes up")
-    return array
+    return [
+        stroke_goal(name, task.place(goals.stroke_list("glyphs", name, strokes, 0, 1))) for name, strokes in table.items()
+    ]
 
 
 def _moved(scale: float, shift: float) -> list[StrokeGoal]:

@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 from jaxsand import task
 from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
 from jaxsand.env.pushing import Pushing
+from jaxsand.goals import stroke_list
 from jaxsand.rules import UntilStill
 from jaxsand.scene import Scene
 from jaxsand.settling import settle_batch
@@ -79,29 +80,19 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
         task.fits(scene, goals[0], "goals")
         task.finite(goals, "goals")
         plans, count = [], len(goals)
-    elif not isinstance(goals, RandomStrokes | Mapping):
-        raise ValueError(f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, or maps [G, H, W]")
-    else:
-        plans = goals.plans(rng) if isinstance(goals, RandomStrokes) else [_strokes(name, goals[name]) for name in goals]
+    elif isinstance(goals, RandomStrokes):
+        plans, count = goals.plans(rng), goals.goals
+    elif isinstance(goals, Mapping):
+        plans, count = [stroke_list("goals", name, goals[name]) for name in goals], len(goals)
         if not plans:
             raise ValueError("goals: got no glyph; give names with strokes [[x0, y0, x1, y1], ...]")
-        count = len(plans)
+    else:
+        raise ValueError(f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, or maps [G, H, W]")
     before = _surfaces(scene, starts, count, rng)
     after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans)
     if isinstance(starts, Level):
         return LevelGoals(jnp.asarray(after))
     return RoughGoals(jnp.asarray(after), jnp.asarray(before))
-
-
-def _strokes(name: Any, strokes: Any) -> np.ndarray:
-    """The strokes [n, 4] of one glyph."""
-    try:
-        found = np.asarray(strokes, float)
-    except (TypeError, ValueError, OverflowError):
-        found = np.empty(0)
-    if found.ndim != 2 or found.shape[1] != 4 or not len(found) or not np.all(np.isfinite(found)):
-        raise ValueError(f"goals: got a glyph without strokes, {name!r}; give names with strokes [[x0, y0, x1, y1], ...]")
-    return found
 
 
 def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Generator) -> np.ndarray:

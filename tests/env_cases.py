@@ -1,0 +1,49 @@
+"""Small environments that tests share, and their programs, compiled once."""
+
+from collections import Counter
+from functools import cache
+
+import jax
+import numpy as np
+
+import jaxsand as js
+from jaxsand import env as envs
+from jaxsand import goals
+from jaxsand.env.pushing import Together
+
+KEY = jax.random.key(0)
+LETTERS = envs.map_pool([goals.letter_map(name)[0] for name in "ALTR"])
+QUICK = js.SteppedPush(1.0, 1)
+SMALL = js.make_scene((16, 16), 0.01, tool=js.Blade())
+LINES = {"line": [[0.1, 0.2, 0.9, 0.3]], "cross": [[0.0, 0.5, 1.0, 0.5], [0.5, 0.0, 0.5, 1.0]]}
+
+
+def one_map(dig, start=None):
+    return envs.map_pool([dig], [start])
+
+
+def small(**options):
+    return js.make("multi-stroke", **{"goals": LINES, "scene": SMALL, "push": QUICK, "batching": Together()} | options)
+
+
+def walks():
+    return js.make("single-stroke", goals=LETTERS, limit=40)
+
+
+def on_sand():
+    return js.make("single-stroke", on=envs.OnSand((3, 3), push=QUICK), goals=one_map(np.ones((3, 3), bool)), limit=40)
+
+
+TRACES = Counter()
+"""How often a method of an environment was traced."""
+
+
+@cache
+def program(env, name="step_env"):
+    """A method of an environment, compiled; equal environments share it."""
+
+    def call(*inputs):
+        TRACES[env, name] += 1
+        return getattr(env, name)(*inputs)
+
+    return jax.jit(call)
