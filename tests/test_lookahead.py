@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from jaxsand.lookahead import look_ahead, one_after_the_other
+from jaxsand.lookahead import look_ahead, one_after_the_other, put_right
+from jaxsand.scene import Scene
 from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokegoals import letters
 from jaxsand.strokeloss import SandLoss
@@ -49,13 +50,39 @@ def test_looking_ahead_finds_the_order_and_leaves_out_what_misleads():
     assert np.all(np.diff(found.losses) < 0)
     np.testing.assert_allclose(found.losses[-1], SAND(found.strokes[None])[0], rtol=1e-3, atol=1e-9)
     assert found.losses[-1] < 0.1 * found.losses[0]
-    assert found.calls <= 3 * 4 * (4 + 18)
+    assert found.calls <= 3 * 4**2 + 2 * 3 * (8 * 3 + 2) + 3
 
 
 def test_what_is_a_little_off_is_put_right():
     crooked = F.strokes + np.array([0.001, -0.0015, -0.0005, 0.001])
     found = look_ahead(Always(crooked), SAND, 3, width=3)
     assert found.losses[-1] < 0.1 * SAND(crooked[None])[0]
+
+
+@dataclass(frozen=True)
+class Bowl:
+    """A loss with parabolas in every number, least at a plan [N, 4]; infinite where its first number exceeds `wall`."""
+
+    scene: Scene
+    least: np.ndarray
+    wall: float = np.inf
+
+    def __call__(self, plans):
+        steep = 1 + np.arange(self.least.size).reshape(self.least.shape)
+        far = (steep * (plans - self.least) ** 2).sum((1, 2))
+        return np.where(plans[:, 0, 0] > self.wall, np.inf, far)
+
+
+def test_parabolas_lead_to_the_least_at_once_and_not_beyond_a_wall():
+    least = F.strokes + np.random.default_rng(0).uniform(-0.002, 0.002, F.strokes.shape)
+    bowl = Bowl(F.scene, least)
+    plan, calls = put_right(bowl, F.strokes, bowl(F.strokes[None])[0])
+    np.testing.assert_allclose(plan, least, atol=1e-8)
+    assert calls == 2 * 3 * (8 * 3 + 2)
+    walled = Bowl(F.scene, least, wall=F.strokes[0, 0])
+    plan, _ = put_right(walled, F.strokes, walled(F.strokes[None])[0])
+    assert plan[0, 0] <= walled.wall
+    assert walled(plan[None])[0] < 0.5 * walled(F.strokes[None])[0]
 
 
 def test_nothing_is_done_where_nothing_helps():
