@@ -18,6 +18,7 @@ from jax.sharding import PartitionSpec as P
 
 from jaxsand.batch import wide_vectors
 from jaxsand.env import LevelGoals, OnSand, Together, Walks, make, pool_of
+from jaxsand.rules import Sweeps, UntilStill
 from jaxsand.strokeloss import pushed
 from jaxsand.swath import SwathPush
 from jaxsand.window import Whole
@@ -25,10 +26,12 @@ from jaxsand.window import Whole
 Tell = Callable[[str], None]
 Row = dict[str, Any]
 _FULL, _FAST, _MAP, _SAND = KINDS = "full push", "fast push", "walk on a map", "walk on sand"
-_VMAP, _SHARED, _LOOP = "vmap", "vmap, a share to each device", "Gymnasium, one by one"
+_VMAP, _SHARED, _LOOP = "vmap", ", a share to each device", "Gymnasium, one by one"
+_LOOSE = {"still to a slope of 0.01": UntilStill(1e-2), "8 sweeps": Sweeps(8)}  # a push may be settled less well
 _ROUNDS = 3
 _STEPS = 3  # of a batch to a round
 _ALONE = 32  # steps to a round of what makes them one by one
+_COMPARED = 256  # pushes that an error is the mean of
 _SHARE = 8  # of the batch: a walk on sand has four times the cells
 
 
@@ -46,26 +49,32 @@ class Contender:
 def bench_env(batch: int = 1024, tell: Tell = lambda _: None, kinds: tuple[str, ...] = KINDS) -> list[Row]:
     """Steps a second of each way, the best of a few rounds in turns, and how many times those of Gymnasium's single
     environment of its kind that is. Compile time is the first call less a later one; `reset_us` what a reset costs in a
-    batch (microseconds)."""
-    ways, made = [], {}
+    batch (microseconds); `error_percent` how far pushes that are settled less well end from those that are still."""
+    ways, made, errors = [], {}, {}
     for kind in kinds:
         made[kind], options = _made(kind)
         many = max(1, batch // _SHARE) if kind == _SAND else batch
-        ways.append(_vmapped(kind, _VMAP, made[kind], many))
-        if jax.local_device_count() > 1:
-            ways.append(_vmapped(kind, _SHARED, made[kind], many, jax.local_device_count()))
+        ways += _by_device(kind, _VMAP, made[kind], many)
         if kind == _FULL:
             env, params = made[kind]
             scene = replace(params.scene, window=Whole())
             ways.append(_vmapped(kind, "on the whole map", (env, replace(params, scene=scene)), batch))
             ways.append(_vmapped(kind, "not sorted by length", (replace(env, batching=Together()), params), batch))
             ways.append(_without(kind, scene, batch))
+        if kind == _FAST:
+            env, params = made[kind]
+            for name, stop in _LOOSE.items():
+                loose = replace(env, settle=stop)
+                ways += _by_device(kind, name, (loose, params), many)
+                errors[name] = errors[name + _SHARED] = 100 * _error(loose, env, params)
         ways += _gymnasium(kind, options)
     rows = _raced(ways, tell)
     alone = {row["kind"]: row["steps_per_second"] for row in rows if row["name"] == _LOOP}
     for row in rows:
         if row["kind"] in alone:
             row["times_gymnasium"] = row["steps_per_second"] / alone[row["kind"]]
+        if row["name"] in errors:
+            row["error_percent"] = errors[row["name"]]
         if row["name"] == _VMAP:
             row["reset_us"] = 1e6 * _reset_seconds(*made[row["kind"]], batch)
     return rows
@@ -79,6 +88,13 @@ def _made(kind: str) -> tuple[tuple[Any, Any], dict[str, Any]]:
         return make("multi-stroke", **options), options
     options = {"goals": pool_of(Walks(), jax.random.key(0), 256)} | ({"on": OnSand()} if kind == _SAND else {})
     return make("single-stroke", **options), options
+
+
+def _by_device(kind: str, name: str, made: tuple[Any, Any], batch: int) -> list[Contender]:
+    """On one device, and on all, where there are more."""
+    devices = jax.local_device_count()
+    shared = [_vmapped(kind, name + _SHARED, made, batch, devices)] if devices > 1 else []
+    return [_vmapped(kind, name, made, batch), *shared]
 
 
 def _vmapped(kind: str, name: str, made: tuple[Any, Any], batch: int, devices: int = 1) -> Contender:
@@ -113,6 +129,15 @@ def _without(kind: str, scene: Any, batch: int) -> Contender:
     strokes = np.random.default_rng(0).uniform(low, high, (batch, 4))
     level = np.zeros((batch, *scene.grid.shape), np.float32)
     return Contender(kind, "no environment", batch, batch, lambda: pushed(scene, level, strokes))
+
+
+def _error(loose: Any, env: Any, params: Any) -> float:
+    """How far random pushes of one environment end from another's: mean distance over mean height."""
+    keys = jax.random.split(jax.random.key(4), _COMPARED)
+    _, state = jax.vmap(env.reset, (0, None))(keys, params)
+    actions = jax.vmap(env.action_space(params).sample)(keys)
+    ends = [jax.jit(jax.vmap(e.step_env, (0, 0, 0, None)))(keys, state, actions, params)[1].height for e in (loose, env)]
+    return float(jnp.abs(ends[0] - ends[1]).mean() / jnp.abs(ends[1]).mean())
 
 
 def _gymnasium(kind: str, options: dict[str, Any]) -> list[Contender]:

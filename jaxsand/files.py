@@ -11,6 +11,8 @@ from typing import Any
 
 
 def existing(path: Path) -> Path:
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; give a file")
     if not path.is_file():
         raise ValueError(f"{path}: no such file; check the name")
     return path

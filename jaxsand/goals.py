@@ -25,16 +25,20 @@ def stroke_list(field: str, name: object, strokes: Any, low: float = -math.inf, 
     """The strokes [n, 4] of a glyph that a user gave.
 
     Raises:
-      ValueError: names the field and the glyph, unless there is a stroke or more, of finite numbers from `low` to `high`.
+      ValueError: names the field, the glyph and the stroke, unless there is a stroke or more, of finite numbers from `low`
+        to `high`.
     """
     try:
-        found = np.array(strokes, float)
+        found = np.array(strokes)
     except (TypeError, ValueError, OverflowError):
         found = np.empty(0)
-    good = found.ndim == 2 and found.shape[1] == 4 and len(found) and np.all(np.isfinite(found))
-    if not good or found.min() < low or found.max() > high:
-        numbers = "finite numbers" if math.isinf(low) else f"from {low:g} to {high:g}"
-        raise ValueError(f"{field}: {name!r:.60} has no list of strokes; give some [x0, y0, x1, y1], {numbers}, y up")
+    if found.ndim != 2 or found.shape[1] != 4 or not len(found) or found.dtype.kind not in "iuf":
+        raise ValueError(f"{field}: {name!r:.60} has no list of strokes; give numbers [[x0, y0, x1, y1], ...], y up")
+    found = found.astype(float)
+    for number, stroke in enumerate(found, 1):
+        if not (np.isfinite(stroke) & (stroke >= low) & (stroke <= high)).all():
+            numbers = "finite numbers" if math.isinf(low) else f"numbers from {low:g} to {high:g}"
+            raise ValueError(f"{field}: {name!r:.60} has {stroke.tolist()} as stroke {number}; give {numbers}")
     return found
 
 

@@ -34,8 +34,12 @@ _PIXELS = 256  # along a panel of a picture, about
 Obs = dict[str, Any]
 
 
-def _known(space: Any, actions: Any) -> None:
-    """Raises ValueError for a step that is none of the four."""
+def _known(space: Any, actions: Any, shape: tuple[int, ...]) -> None:
+    """Raises ValueError for a step that is none of the four, and for strokes of another shape."""
+    if isinstance(space, spaces.Box):
+        strokes = np.asarray(actions)
+        if strokes.dtype.kind not in "fiu" or strokes.shape != shape:
+            raise ValueError(f"action: got {strokes.dtype} of shape {list(strokes.shape)}; give numbers {list(shape)}")
     if isinstance(space, spaces.Discrete):
         steps = np.asarray(actions)
         if steps.dtype.kind not in "iu" or (steps < 0).any() or (steps >= space.n).any():
@@ -62,7 +66,7 @@ class _Sand(gymnasium.Env):
         return _view(self.shown), _arrays(about)
 
     def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        _known(self.action_space, action)
+        _known(self.action_space, action, self.action_space.shape or ())
         # No environment draws anything in a step: any key will do.
         out = _alone(self.core)[1](jax.random.key(0), self.state, np.asarray(action), self.params)
         obs, self.state, reward, terminated, truncated, info = out
@@ -85,7 +89,7 @@ class SingleStrokeEnv(_Sand):
 
 class MultiStrokeEnv(_Sand):
     """Observations are "observation" and "achieved_goal", both the sand as it lies, and "desired_goal": maps [H, W] in units
-    of the blade's depth. An action holds x0, y0, x1, y1 from -1 to 1.
+    of the blade's depth. An action holds x0, y0, x1, y1 from -1 to 1; numbers beyond push from off the map.
 
     The reward L_t - L_{t+1} depends on the map before the push, which is in info["previous"]: so who relabels goals must
     keep the infos (Stable-Baselines3: replay_buffer_kwargs={"copy_info_dict": True}).
@@ -149,7 +153,7 @@ class SandVectorEnv(VectorEnv):
         return _view(self.shown), _masked(_arrays(about), np.ones(self.num_envs, bool))
 
     def step(self, actions: Any) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        _known(self.single_action_space, actions)
+        _known(self.single_action_space, actions, self.action_space.shape or ())
         keys = jax.random.split(_key(self.np_random), self.num_envs)
         out = _together(self.core)[1](keys, self.state, np.asarray(actions), self.params)
         obs, self.state, *rest, info = out

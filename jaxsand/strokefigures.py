@@ -47,7 +47,7 @@ def found_figure(shown: list[tuple[str, float, np.ndarray, np.ndarray]], columns
         top, below = axes[2 * (k // columns) : 2 * (k // columns) + 2, k % columns]
         for ax, height in ((top, goal), (below, found)):
             image = ax.imshow(1e3 * height, origin="lower", cmap="RdYlBu_r", vmin=-10, vmax=10)
-        top.set_title(f"{name}  {iou:.2f}", fontsize=8)
+        top.set_title(f"{name}  {iou:.2f}", fontsize=8, parse_math=False)
     figure.colorbar(image, ax=axes, label="height over the sand before (mm)", shrink=0.7, aspect=30)
     return figure
 

@@ -1,6 +1,5 @@
 """Small environments that tests share, and their programs, compiled once."""
 
-from collections import Counter
 from functools import cache
 
 import jax
@@ -34,16 +33,7 @@ def on_sand():
     return js.make("single-stroke", on=envs.OnSand((3, 3), push=QUICK), goals=one_map(np.ones((3, 3), bool)), limit=40)
 
 
-TRACES = Counter()
-"""How often a method of an environment was traced."""
-
-
 @cache
 def program(env, name="step_env"):
     """A method of an environment, compiled; equal environments share it."""
-
-    def call(*inputs):
-        TRACES[env, name] += 1
-        return getattr(env, name)(*inputs)
-
-    return jax.jit(call)
+    return jax.jit(getattr(env, name))

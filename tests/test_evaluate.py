@@ -1,7 +1,8 @@
 """Judging learners by glyphs: with a policy that knows the answers, and one that knows one stroke of each."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -44,7 +45,10 @@ def test_a_policy_that_knows_the_strokes_gets_all_right():
         assert row["iou"] > 0.99
         np.testing.assert_allclose(row["pushes"], glyph.strokes, atol=1e-6)
     json.dumps(report)
-    assert picture(GLYPHS, report).axes
+    odd = replace(GLYPHS[0], name=r"$\frac$")  # no formula, but what a user called it
+    drawn = picture([odd], {"glyphs": {odd.name: report["glyphs"][GLYPHS[0].name]}})
+    drawn.savefig(BytesIO())
+    assert drawn.axes[0].get_title().startswith(odd.name)
 
 
 def test_one_stroke_again_and_again_is_one_right_stroke():
@@ -75,7 +79,12 @@ def test_a_glyph_file_is_read_as_letters_are(tmp_path):
         ("[1]", "got no glyph"),
         ('{"A": []}', "'A' has no list of strokes"),
         ('{"A": [[0, 0, 1]]}', "'A' has no list of strokes"),
-        ('{"A": [[0, 0, 1, 2]]}', "'A' has no list of strokes"),
+        ('{"A": [[0, 0, 1, 1], [0, 0, 1, 2]]}', r"'A' has \[0.0, 0.0, 1.0, 2.0\] as stroke 2; give numbers from 0 to 1"),
+        ('{"A": [["0", "0", "1", "1"]]}', "'A' has no list of strokes"),
+        ('{"A": [[true, false, true, true]]}', "'A' has no list of strokes"),
+        ('{"A": {"B": 1}}', "'A' has no list of strokes"),
+        ('{"A": [[0, 0, 1, 1]], "A": [[0, 0, 1, 1]]}', "got the name 'A'; give each glyph a name of its own"),
+        (r'{"b\ud800": [[0, 0, 1, 1]]}', "got the name .*; give each glyph a name .* that can be printed"),
         ('{"A": [[0, 0, 1, "x"]]}', "'A' has no list of strokes"),
         ('{"A": [[1' + 400 * "0" + ", 0, 1, 1]]}", "'A' has no list of strokes"),
         (100_000 * "[", "cannot read"),
@@ -102,6 +111,8 @@ def test_curves_count_what_was_simulated_up_to_each_validation(tmp_path, capsys)
     run.mkdir()
     assert main([str(run), "--out", str(tmp_path / "c.png")]) == 2
     assert "error: " in capsys.readouterr().err
+    assert main([str(run), "--out", str(tmp_path / "c.xyz")]) == 2
+    assert "ends in .png" in capsys.readouterr().err
     rows = [{"kind": "train", "seconds": 30 * k, "pushes": 10.0} for k in (1, 2)]
     rows.append({"kind": "validate", "seconds": 60, "score": 0.5})
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"kind": "tra')

@@ -157,6 +157,13 @@ def test_what_there_is_not_is_named():
     for action in (-1, 4, 1.5):
         with pytest.raises(ValueError, match=f"^action: got {action}; give 0 to 3"):
             env.step(action)
+    strokes = jaxsand.gym.MultiStrokeEnv(**QUICK)
+    strokes.reset(seed=0)
+    for action in (np.zeros(3), "x"):
+        with pytest.raises(ValueError, match=r"^action: got .* of shape .*; give numbers \[4\]"):
+            strokes.step(action)
+    with pytest.raises(ValueError, match=r"^action: got shape \[3\]; give 4 numbers"):
+        strokes.core.step_env(None, strokes.state, np.zeros(3), strokes.params)
     with pytest.raises(ValueError, match="^wind: no option of multi-stroke"):
         jaxsand.gym.MultiStrokeEnv(wind=3)
 

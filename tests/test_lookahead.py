@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsand.lookahead import look_ahead, one_after_the_other, put_right
-from jaxsand.scene import Scene
+from jaxsand.scene import Scene, make_scene
 from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokegoals import letters
 from jaxsand.strokeloss import SandLoss
@@ -76,13 +76,33 @@ class Bowl:
 def test_parabolas_lead_to_the_least_at_once_and_not_beyond_a_wall():
     least = F.strokes + np.random.default_rng(0).uniform(-0.002, 0.002, F.strokes.shape)
     bowl = Bowl(F.scene, least)
-    plan, calls = put_right(bowl, F.strokes, bowl(F.strokes[None])[0])
+    plan, calls = put_right(bowl, F.strokes, bowl(F.strokes[None])[0])  # cells of 10 mm: within the first quarter
     np.testing.assert_allclose(plan, least, atol=1e-8)
     assert calls == 2 * 3 * (8 * 3 + 2)
     walled = Bowl(F.scene, least, wall=F.strokes[0, 0])
     plan, _ = put_right(walled, F.strokes, walled(F.strokes[None])[0])
     assert plan[0, 0] <= walled.wall
     assert walled(plan[None])[0] < 0.5 * walled(F.strokes[None])[0]
+
+
+def test_where_a_loss_only_falls_ends_go_the_whole_way_but_not_off_the_map():
+    scene = make_scene((10, 30), 0.01, tool=F.scene.tool)
+    start = np.array([[0.1, 0.02, 0.29, 0.05]])
+    aim = np.array([[0.2, -0.1, 0.4, 0.15]])
+
+    @dataclass(frozen=True)
+    class Roof:
+        scene: Scene
+
+        def __call__(self, plans):
+            gone = ((plans - start) @ np.sign(aim - start)[0]).sum(1)
+            return 1 - gone - gone**2  # the farther, the more a step gains
+
+    plan, _ = put_right(Roof(scene), start, 1.0)
+    np.testing.assert_allclose(plan, [[0.1035, 0.0165, 0.2935, 0.0535]])
+    edge, _ = put_right(Roof(scene), np.array([[0.1, 0.006, 0.294, 0.05]]), 1.0)
+    assert edge[0, 1] == pytest.approx(0.005)
+    assert edge[0, 2] == pytest.approx(0.295)
 
 
 def test_nothing_is_done_where_nothing_helps():

@@ -67,12 +67,9 @@ def run_evaluation(options: argparse.Namespace) -> None:
         learner: Any = learner_of(Path(options.run))
         state = load(Path(options.run), learner)
         if learner.name == "dqn":
-            report = _on_maps(learner, state, options, tell)
+            report = _on_maps(learner, state, options, tell, out)
         else:
             report = _on_sand(learner.policy(state), options, tell, out)
-    if out:
-        with written(out / "evaluate.json") as path:
-            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     show(options, report, _evaluated)
 
@@ -142,19 +139,29 @@ def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], Non
     if out:
         from jaxsand.render import save_figure
 
+        _keep(report, out)
         with written(out / "evaluate.png") as path:
             save_figure(picture(glyphs, report), path)
     return report
 
 
-def _on_maps(learner: Any, state: Any, options: argparse.Namespace, tell: Callable[[str], None]) -> dict[str, Any]:
+def _on_maps(
+    learner: Any, state: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
+) -> dict[str, Any]:
     for option in ("glyphs", "goals", "refine"):
         if getattr(options, option):
             raise ValueError(f"{option}: has an effect on strokes only, and dqn walks over maps; leave it out")
     from train.evaluate_maps import evaluate
 
     report: dict[str, Any] = evaluate(learner, state, width=options.lookahead or 0, tell=tell)
+    if out:
+        _keep(report, out)
     return report
+
+
+def _keep(report: dict[str, Any], out: Path) -> None:
+    with written(out / "evaluate.json") as path:
+        path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
 
 
 def _evaluated(report: dict[str, Any]) -> str:

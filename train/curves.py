@@ -69,6 +69,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def draw() -> None:
+        if options.out.suffix.lower() != ".png":
+            raise ValueError(f"out: got {options.out}; give a name that ends in .png")
         names = [run.name for run in options.runs]
         figure = curves_figure({run.name if names.count(run.name) == 1 else str(run): curve(run) for run in options.runs})
         with written(options.out) as path:

@@ -25,15 +25,17 @@ def read_glyphs(path: Path) -> list[StrokeGoal]:
       ValueError: names the file or the glyph, and what is wrong.
     """
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=tuple)
     except (OSError, ValueError, RecursionError) as error:
         why = type(error).__name__
         raise ValueError(f"glyphs: cannot read {path} ({why}); give a JSON file of names and strokes") from None
-    if not isinstance(table, dict) or not table:
+    if not isinstance(table, tuple) or not table:  # an object's pairs
         raise ValueError(f"glyphs: got no glyph in {path}; give a JSON object of names and strokes")
-    return [
-        stroke_goal(name, task.place(goals.stroke_list("glyphs", name, strokes, 0, 1))) for name, strokes in table.items()
-    ]
+    names = [name for name, _ in table]
+    for name in names:
+        if not (name.strip() and name.isprintable()) or names.count(name) > 1:
+            raise ValueError(f"glyphs: got the name {name!r:.60}; give each glyph a name of its own that can be printed")
+    return [stroke_goal(name, task.place(goals.stroke_list("glyphs", name, strokes, 0, 1))) for name, strokes in table]
 
 
 def _moved(scale: float, shift: float) -> list[StrokeGoal]:

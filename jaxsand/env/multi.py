@@ -105,7 +105,8 @@ class StrokeParams:
 
 @dataclass(frozen=True)
 class MultiStroke:
-    """An action holds x0, y0, x1, y1, each -1 to 1 from the first to the last cell centre of the map.
+    """An action holds x0, y0, x1, y1, each -1 to 1 from the first to the last cell centre of the map; numbers beyond that
+    push from off the map.
 
     With L the l2 distance of goal and map, sqrt(sum (goal - h)^2), in units of the blade's depth, the reward is
     L_t - L_{t+1}. An episode ends with its last stroke (truncated at `limit`), or when a `Stop` asks for it (terminated).
@@ -131,6 +132,8 @@ class MultiStroke:
         """One stroke, without a new episode after the last; nothing is drawn from the key."""
         del key
         action = jnp.asarray(action, state.height.dtype)
+        if action.shape != (self.stop.size,):
+            raise ValueError(f"action: got shape {list(action.shape)}; give {self.stop.size} numbers")
         push = self.batching.pushing(self.push, self.settle)
         after, outcome = push(params.scene, state.height, self.stroke(action, params))
         after = jnp.where(jnp.all(jnp.isfinite(after)), after, state.height)
