@@ -50,6 +50,11 @@ def test_the_command_gives_its_options_and_prints_the_figures(monkeypatch, capsy
     assert "strokes: got 1000; give at most 100" in capsys.readouterr().err
 
 
+def test_a_wrong_method_is_named():
+    with pytest.raises(ValueError, match="^methods: got 'luck'; give some of 'policy, looking ahead', .*'plan_sand'"):
+        compare(1, 1, 1, 0, lambda _: None, ["plan_sand", "luck"])
+
+
 @pytest.mark.slow
 def test_every_method_digs():
     rows = compare(1, 12, 400, 0, lambda _: None)

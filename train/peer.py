@@ -1,6 +1,6 @@
 """Goals such as those of Kreis et al. 2025 (arXiv:2509.06469), rectangles, L shapes and polygons, dug by several methods.
 
-    python -m train.peer [--goals N] [--strokes N] [--pushes N] [--seed K] [--json]
+    python -m train.peer [--goals N] [--strokes N] [--pushes N] [--methods NAME ...] [--seed K] [--json]
 
 A bed of 60 x 30 cells of 10 mm, 30 degrees; rectangles 40 to 60 mm wide and L shapes of 60 to 100 mm, 5 to 20 mm deep,
 polygons 10 to 30 mm deep. The blade here goes as deep as the goal. Their tool is another one, and what they average over is
@@ -104,11 +104,22 @@ def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:
     }
 
 
-def compare(number: int, most: int, pushes: int, key: int, tell: Callable[[str], None]) -> list[dict[str, Any]]:
-    """A row for each method, means over the goals, and the published figures."""
+def compare(
+    number: int, most: int, pushes: int, key: int, tell: Callable[[str], None], only: list[str] | None = None
+) -> list[dict[str, Any]]:
+    """A row for each method, means over the goals, and the published figures.
+
+    Raises:
+      ValueError: for a method that there is not.
+    """
+    found = methods(most, pushes, key)
+    for name in only or ():
+        if name not in found:
+            raise ValueError(f"methods: got {name!r}; give some of {', '.join(map(repr, found))}")
     goals = peer_goals(number, key)
     rows = []
-    for name, find in methods(most, pushes, key).items():
+    for name in only or found:
+        find = found[name]
         figures, began = [], time.perf_counter()
         for goal in goals:
             tell(f"{name}: {goal.name}")
@@ -130,13 +141,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--pushes", type=count, default=4000, metavar="N", help="pushes a goal for searches and gradients (4000)"
     )
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help="only these (all; a wrong name lists them)")
     parser.add_argument("--seed", type=seed, default=0, metavar="K")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
 
     def show() -> None:
         check_whole("strokes", options.strokes, 1, 100)
-        rows = compare(options.goals, options.strokes, options.pushes, options.seed, progress())
+        rows = compare(options.goals, options.strokes, options.pushes, options.seed, progress(), options.methods)
         print(as_json({"rows": rows}) if options.json else "\n".join(as_table(rows, "method")))
 
     return ended(show)
