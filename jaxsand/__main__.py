@@ -57,7 +57,12 @@ def _shape(commands: Any) -> None:
         metavar="N",
         help="pushes that may be tried (optimise, policy --refine: 4000; search: 1000 a stroke)",
     )
-    p.add_argument("--lookahead", type=width, metavar="K", help="policy: try its K likeliest strokes on K best plans")
+    p.add_argument(
+        "--lookahead",
+        type=width,
+        metavar="K",
+        help="policy: try its K likeliest strokes on K best plans, put the best right",
+    )
     p.add_argument("--refine", action="store_true", help="policy: improve its plan by gradients")
     p.add_argument("--seed", type=seed, metavar="K", help="for the random choices of optimise and search (0)")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")

@@ -27,7 +27,7 @@ Tell = Callable[[str], None]
 Row = dict[str, Any]
 _FULL, _FAST, _MAP, _SAND = KINDS = "full push", "fast push", "walk on a map", "walk on sand"
 _VMAP, _SHARED, _LOOP = "vmap", ", a share to each device", "Gymnasium, one by one"
-_LOOSE = {"still to a slope of 0.01": UntilStill(1e-2), "8 sweeps": Sweeps(8)}  # a push may be settled less well
+_LOOSE = {"0.01 above repose": UntilStill(1e-2), "8 sweeps": Sweeps(8)}  # a push may be settled less well
 _ROUNDS = 3
 _STEPS = 3  # of a batch to a round
 _ALONE = 32  # steps to a round of what makes them one by one

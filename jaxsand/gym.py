@@ -35,15 +35,15 @@ Obs = dict[str, Any]
 
 
 def _known(space: Any, actions: Any, shape: tuple[int, ...]) -> None:
-    """Raises ValueError for a step that is none of the four, and for strokes of another shape."""
-    if isinstance(space, spaces.Box):
-        strokes = np.asarray(actions)
-        if strokes.dtype.kind not in "fiu" or strokes.shape != shape:
-            raise ValueError(f"action: got {strokes.dtype} of shape {list(strokes.shape)}; give numbers {list(shape)}")
-    if isinstance(space, spaces.Discrete):
-        steps = np.asarray(actions)
-        if steps.dtype.kind not in "iu" or (steps < 0).any() or (steps >= space.n).any():
-            raise ValueError(f"action: got {actions!r}; give 0 to {space.n - 1}: north, east, south, west")
+    """Raises ValueError for actions of another shape, and for a step that is none of the four."""
+    try:
+        given = np.asarray(actions)
+    except ValueError:
+        raise ValueError(f"action: got {actions!r:.60}; give numbers {list(shape)}") from None
+    if given.dtype.kind not in "fiu" or given.shape != shape:
+        raise ValueError(f"action: got {given.dtype} of shape {list(given.shape)}; give numbers {list(shape)}")
+    if isinstance(space, spaces.Discrete) and (given.dtype.kind == "f" or (given < 0).any() or (given >= space.n).any()):
+        raise ValueError(f"action: got {actions!r}; give 0 to {space.n - 1}: north, east, south, west")
 
 
 class _Sand(gymnasium.Env):

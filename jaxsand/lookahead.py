@@ -1,5 +1,5 @@
-"""Looking ahead with the simulator as a model: what a policy proposes is tried on the sand and put right there, and the best
-plans go on."""
+"""Looking ahead with the simulator as a model: what a policy proposes is tried on the sand, the best plans go on, and the
+closest is put right."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -81,7 +81,8 @@ def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray
 
         s (f(-s) - f(s)) / (2 (f(s) - 2 f(0) + f(-s)))   in each number, at most s.
 
-    The closest of all that was tried is taken: 2 N (8 N + 2) calls.
+    The closest of all that was tried is taken: 2 N (8 N + 2) calls. Nothing leaves the map: where a move would, it is
+    shorter, and the parabola only about right.
     """
     if not len(plan):
         return plan, 0

@@ -178,7 +178,7 @@ def test_a_batch_by_length_is_its_maps():
 
 
 def test_the_fast_push_digs_too():
-    env, params = small(push=js.SwathPush(), limit=2)
+    env, params = small(push=js.SwathPush(), limit=jnp.array(2))
     _, state = env.reset(KEY, params)
     action = env.action(jnp.float32([0.03, 0.05, 0.13, 0.08]), params)
     _, after, *_, info = program(env)(KEY, state, action, params)

@@ -157,6 +157,14 @@ def test_what_there_is_not_is_named():
     for action in (-1, 4, 1.5):
         with pytest.raises(ValueError, match=f"^action: got {action}; give 0 to 3"):
             env.step(action)
+    for action in (np.array([1]), [0, [1]]):
+        with pytest.raises(ValueError, match=r"^action: got .*; give numbers \[\]"):
+            env.step(action)
+    many = jaxsand.gym.SandVectorEnv("single-stroke", 3)
+    many.reset(seed=0)
+    for action in (1, [0, 1], np.zeros((3, 1), int)):
+        with pytest.raises(ValueError, match=r"^action: got .* of shape .*; give numbers \[3\]"):
+            many.step(action)
     strokes = jaxsand.gym.MultiStrokeEnv(**QUICK)
     strokes.reset(seed=0)
     for action in (np.zeros(3), "x"):

@@ -75,7 +75,7 @@ def test_only_what_is_dug_counts_for_drawn_goals():
         (lambda: small(goals=[np.zeros((16, 16))]), "^goals: got list; give RandomStrokes"),
         (lambda: small(starts="rough"), "^starts: got 'rough'; give Level"),
         (lambda: small(goals={"x": []}), "^goals: .x. has no list of strokes"),
-        (lambda: small(goals={"x": [[0, 0, 1, 1], [0]]}), "^goals: .x. has no list of strokes; give some"),
+        (lambda: small(goals={"x": [[0, 0, 1, 1], [0]]}), "^goals: .x. has no list of strokes; give numbers"),
         (lambda: small(goals={"x": [[0, 0, 1, 1j]]}), "^goals: .x. has no list of strokes"),
         (lambda: small(goals={"x": [[0, 0, 1, np.inf]]}), "^goals: .x. has .* as stroke 1; give finite numbers"),
         (lambda: small(goals=np.array([[["a"]]])), "^goals: got <U1; give one or more maps"),

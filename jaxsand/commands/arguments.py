@@ -46,7 +46,7 @@ def count(text: str) -> int:
 
 
 def width(text: str) -> int:
-    """Of a look-ahead, which pushes its square at every stroke."""
+    """Of a look-ahead, which pushes its square at every stroke; putting N strokes right takes 16 N^2 pushes more."""
     if not text.isdecimal() or not 1 <= int(text) <= WIDEST:
         raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number from 1 to {WIDEST}")
     return int(text)
