@@ -70,6 +70,12 @@ def as_json(report: dict[str, Any], **layout: Any) -> str:
     return json.dumps(plain(report), allow_nan=False, **layout)
 
 
+def write_json(path: Path, report: dict[str, Any]) -> None:
+    """A file that holds the report, one value a line."""
+    with written(path) as beside:
+        beside.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+
+
 def as_table(rows: list[dict[str, Any]], title: str) -> list[str]:
     """Rows of figures as lines of text: what is text in a row names it, and None is a dash."""
     texts = [" ".join(v for v in row.values() if isinstance(v, str)) for row in rows]

@@ -12,9 +12,8 @@ from jaxsand.strokeloss import SandLoss
 
 @dataclass(frozen=True)
 class Stages:
-    """What follows the policy: a beam of so many plans that are tried on the sand, of which the best is put
-    right, its `width` (0: none), and gradients at a
-    cost of `polish` calls of the simulator (0: none)."""
+    """What follows the policy: a beam of so many plans that are tried on the sand, its `width` (0: none), the best of
+    which is put right, and gradients at a cost of `polish` calls of the simulator (0: none)."""
 
     width: int = 0
     polish: int = 0

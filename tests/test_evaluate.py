@@ -45,6 +45,7 @@ def test_a_policy_that_knows_the_strokes_gets_all_right():
         assert row["iou"] > 0.99
         np.testing.assert_allclose(row["pushes"], glyph.strokes, atol=1e-6)
     json.dumps(report)
+    assert picture(GLYPHS, report).axes
     odd = replace(GLYPHS[0], name=r"$\frac$")  # no formula, but what a user called it
     drawn = picture([odd], {"glyphs": {odd.name: report["glyphs"][GLYPHS[0].name]}})
     drawn.savefig(BytesIO())

@@ -9,7 +9,7 @@ from typing import Any
 
 import jaxsand
 from jaxsand.commands.printing import lines, show
-from jaxsand.files import as_json, as_table, existing, folder, progress, written
+from jaxsand.files import as_table, existing, folder, progress, write_json, written
 
 MINUTES = {"hindsight": 30.0, "dqn": 10.0, "ddpg": 10.0}
 """How long each learner trains unless it is told."""
@@ -20,6 +20,7 @@ EPISODES = 10_000
 SHIPPED = Path(jaxsand.__file__).parent / "data" / "policy.npz"
 """Where the policy lies that jaxsand comes with."""
 
+_REPORT = "evaluate.json"
 _POLISH = 4_000  # calls of the simulator for --refine
 
 
@@ -133,13 +134,11 @@ def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], Non
         raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(SETS)}")
     glyphs = read_glyphs(existing(options.glyphs)) if options.glyphs else SETS[options.goals or "letters"]()
     stages = Stages(options.lookahead or 0, _POLISH if options.refine else 0)
-    if out:
-        folder(out)
     report = evaluate(policy, glyphs, stages, tell)
     if out:
         from jaxsand.render import save_figure
 
-        _keep(report, out)
+        write_json(out / _REPORT, report)
         with written(out / "evaluate.png") as path:
             save_figure(picture(glyphs, report), path)
     return report
@@ -155,13 +154,8 @@ def _on_maps(
 
     report: dict[str, Any] = evaluate(learner, state, width=options.lookahead or 0, tell=tell)
     if out:
-        _keep(report, out)
+        write_json(out / _REPORT, report)
     return report
-
-
-def _keep(report: dict[str, Any], out: Path) -> None:
-    with written(out / "evaluate.json") as path:
-        path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
 
 
 def _evaluated(report: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, BinaryIO, Literal, Protocol
 
-from jaxsand.files import as_json, folder, progress, written
+from jaxsand.files import as_json, folder, progress, write_json
 from train.checkpoints import At, State, described, restored, save, unwritable, where
 from train.checkpoints import load as load_state
 
@@ -202,8 +202,7 @@ def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State,
     if not there:
         versions = {name: metadata.version(name) for name in _PACKAGES} | {"python": platform.python_version()}
         config = {"name": learner.name, "seed": seed, "learner": described(learner), "versions": versions}
-        with written(out / _CONFIG) as beside:
-            beside.write_text(as_json(config, indent=1) + "\n", encoding="utf-8")
+        write_json(out / _CONFIG, config)
     return load_state(out / _LAST, state) if (out / _LAST).exists() else (state, At())
 
 

@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import Any
 
 from jaxsand.commands.printing import show
-from jaxsand.files import as_json, folder, progress, written
+from jaxsand.files import folder, progress, write_json, written
 
 
 def run_benchmark(options: argparse.Namespace) -> None:
@@ -43,8 +43,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
             if shown:
                 with written(out / "bench-strokes-found.png") as path:
                     save_figure(found_figure(shown), path)
-        with written(out / f"bench-{options.what}.json") as path:
-            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+        write_json(out / f"bench-{options.what}.json", report)
     tell("")
     show(options, report, table)
 

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from jaxsand.commands.printing import lines, plain_name, read_cell, show
-from jaxsand.files import as_json, folder, progress, read_text, written
+from jaxsand.files import folder, progress, read_text, write_json, written
 
 
 def run_plan(options: argparse.Namespace) -> None:
@@ -53,7 +53,6 @@ def run_plan(options: argparse.Namespace) -> None:
         tell("drawing")
         with written(files[0]) as path:
             save_figure(plan_figure(dig, found), path)
-        with written(files[1]) as path:
-            path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+        write_json(files[1], report)
     tell("")
     show(options, report, lines)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxsand.commands.printing import plain_name, read_cell, show
-from jaxsand.files import as_json, existing, folder, progress, read_text, written
+from jaxsand.files import existing, folder, progress, read_text, write_json, written
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,8 +59,7 @@ def run_shape(options: argparse.Namespace) -> None:
         planned -= result.seconds["compile"]
     ended = time.perf_counter()
     report = _report(result, ended - started, planned, ended - began, files)
-    with written(files["result.json"]) as path:
-        path.write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+    write_json(files["result.json"], report)
     tell("")
     show(options, report, _summary)
 
