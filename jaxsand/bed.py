@@ -138,9 +138,9 @@ def halo(x: jax.Array, value: float = jnp.nan) -> jax.Array:
 
     By concatenation, which XLA vectorises on CPUs, and behind a barrier, lest it be computed anew for every neighbour.
     """
-    row = jnp.full((1, x.shape[1]), value, x.dtype)
+    row = jnp.full((1, *x.shape[1:]), value, x.dtype)
     x = lax.concatenate([row, x, row], 0)
-    column = jnp.full((x.shape[0], 1), value, x.dtype)
+    column = jnp.full((x.shape[0], 1, *x.shape[2:]), value, x.dtype)
     return lax.optimization_barrier(lax.concatenate([column, x, column], 1))
 
 

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.bed import Bed, Rim, at, halo
-from jaxsand.grid import Link, links
+from jaxsand.grid import Link, Neighbours, links
 
 Fluxes = tuple[jax.Array, ...]
 NARROW = 0.05  # in an open share below this sand stands no higher than it would in this one
@@ -92,12 +92,18 @@ def flows(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
 
 def gained(bed: Bed, flow: Fluxes) -> jax.Array:
     """What each cell [H, W] gains from the fluxes over its links."""
+    net = received(bed.neighbours, flow)
+    return net if bed.rim is None else net - flow[-1]
+
+
+def received(neighbours: Neighbours, flow: Fluxes) -> jax.Array:
+    """What each cell [H, W, ...] receives over links, less what it gives."""
     net = jnp.zeros((), flow[0].dtype)
-    for (di, dj, _), f in zip(links(bed.neighbours), flow, strict=False):
-        rows, columns = f.shape
+    for (di, dj, _), f in zip(links(neighbours), flow, strict=False):
+        rows, columns = f.shape[:2]
         right, left = f[:, max(dj, 0) : columns + min(dj, 0)], f[:, max(-dj, 0) : columns - max(dj, 0)]
         net = net + (right[di:] - left[: rows - di])
-    return net if bed.rim is None else net - flow[-1]
+    return net
 
 
 def fluxes_zero(bed: Bed, u: jax.Array) -> Fluxes:

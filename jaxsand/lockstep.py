@@ -1,10 +1,14 @@
 """Loops of a batch of maps in lockstep, each until it is done: how loop.py runs under `vmap`.
 
 The step's number is one number, not one for each map, and the tape that reverse mode reads is written in place.
+
+A step may say that it computes a batch by itself (`Step.trailing`): then `vmap` moves the batch to the last axis of all
+arrays, the vector unit's lanes, where it stays for the whole loop, and on a CPU takes no more maps at a time than a core's
+cache holds. Such a step leaves a map that is ready as it is, and its `done` speaks for all maps at once.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -26,6 +30,12 @@ class Lanes:
     step: Any
     bound: int
     lanes: int
+    width: int = 0  # maps in the last axis
+
+    @property
+    def trailing(self) -> bool:
+        """Whether the step computes maps in the last axis of everything."""
+        return getattr(self.step, "trailing", False)
 
     @property
     def room(self) -> int:
@@ -43,7 +53,11 @@ class Lanes:
 
     def taken(self, count: jax.Array) -> jax.Array | None:
         """What is said of the number of steps; nothing where that is known."""
-        return None if self.done is None else count
+        return None if self.done is None else self.said(count)
+
+    def said(self, number: jax.Array) -> jax.Array:
+        """What is one and the same for all maps, said of each."""
+        return jnp.broadcast_to(number[..., None], (*number.shape, self.width)) if self.width else number
 
     def total(self, count: jax.Array | None) -> jax.Array:
         """The largest number of steps in any lane."""
@@ -97,12 +111,44 @@ def batched(program: Callable, loop: Lanes, params: Tree, *rest: Tree) -> Tree:
 
     @run.def_vmap
     def rule(size: int, mapped: list, params: Tree, rest: Tree) -> tuple[Tree, Tree]:
+        if loop.trailing:
+            out = _trailing(program, loop, size, mapped, (params, rest))
+            return out, jax.tree.map(lambda _: True, out)
         axes = jax.tree.map(lambda yes: 0 if yes else None, mapped[0])
         rest = jax.tree.map(lambda yes, x: x if yes else jnp.broadcast_to(x, (size, *x.shape)), mapped[1], rest)
         out = batched(program, loop.over(axes), params, *rest)
         return out, jax.tree.map(lambda _: True, out)
 
     return run(params, rest)
+
+
+def _trailing(program: Callable, loop: Lanes, size: int, mapped: list, args: Tree) -> Tree:
+    """`program` with one more batch in the last axis, chunk by chunk; the result gains the axis in front."""
+    leaves, tree = jax.tree.flatten(args)
+    yes = jax.tree.leaves(mapped)
+    chunk = min(size, loop.step.together)
+    chunks = -(-size // chunk)
+    chunk = -(-size // chunks)
+
+    def some(part: list) -> Tree:
+        own, last = iter(part), []
+        for x, y in zip(leaves, yes, strict=True):
+            x = jnp.moveaxis(next(own), 0, -1) if y else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), chunk))
+            last.append(x.reshape(*x.shape[:-2], loop.width * chunk) if loop.width else x)
+        params, rest = jax.tree.unflatten(tree, last)
+        out = batched(program, replace(loop, width=max(loop.width, 1) * chunk), params, *rest)
+        if loop.width:
+            out = jax.tree.map(lambda x: x.reshape(*x.shape[:-1], loop.width, chunk), out)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), out)
+
+    batch = [x for x, y in zip(leaves, yes, strict=True) if y]
+    if chunks == 1:
+        return some(batch)
+    extra = chunks * chunk - size
+    if extra:
+        batch = [jnp.concatenate([x, jnp.broadcast_to(x[-1:], (extra, *x.shape[1:]))]) for x in batch]
+    out = lax.map(some, [x.reshape(chunks, chunk, *x.shape[1:]) for x in batch])
+    return jax.tree.map(lambda x: x.reshape(chunks * chunk, *x.shape[2:])[:size], out)
 
 
 def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
@@ -158,6 +204,7 @@ def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tr
         lambda c: ~jnp.all(c[0][3]), stretch, (carry, jnp.int32(loop.room), memory)
     )
     places = jnp.broadcast_to(places, (*jax.tree.leaves(state)[0].shape[: loop.lanes], slots))
+    places = loop.said(places)
     return state, loop.taken(count), tape, (places, saved)
 
 
@@ -214,5 +261,6 @@ def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, memory: Tree, 
         return first, jnp.zeros((), bool), jnp.where(places < first, places, -1), saved, tape, carry
 
     places, saved = memory
-    start = (total, jnp.ones((), bool), places.reshape(-1, places.shape[-1])[0], saved, tape, carry)
+    places = places[:, 0] if loop.width else places.reshape(-1, places.shape[-1])[0]
+    start = (total, jnp.ones((), bool), places, saved, tape, carry)
     return lax.while_loop(lambda c: c[0] > 0, stretch, start)[-1]

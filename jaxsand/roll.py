@@ -23,13 +23,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand.advance import step_ahead
 from jaxsand.bed import Lost
 from jaxsand.displace import Hanging, Job, Shares, contact, outwards, pass_on, settle_around, shares, spread, whole
 from jaxsand.flux import NARROW
 from jaxsand.legs import Pushed, State, along_legs, in_window, over_the_map
 from jaxsand.loop import Plain, repeat_until
-from jaxsand.push import SteppedPush, arrived
+from jaxsand.push import SteppedPush
 from jaxsand.scene import Scene
 from jaxsand.swath import complete
 from jaxsand.sweep import Flow
@@ -52,6 +51,22 @@ def roll_along(
         return repeat_until(partial(arrived, push), Plain(partial(_advance, push)), bound, params, state)[0]
 
     return along_legs(scene, height, path, push.rate, leg, record)
+
+
+def step_ahead(
+    substep: float, job: Job, start: Pose, length: jax.Array, k: jax.Array
+) -> tuple[Pose, Pose, jax.Array, jax.Array]:
+    """The poses before and after sub-step k of a leg, the way between (m), and which part of a whole sub-step that is."""
+    whole = substep * job.bed.spacing
+    begin = k * whole
+    ahead = jnp.minimum(whole, length - begin)
+    pose = Pose(start.x + begin * start.cos, start.y + begin * start.sin, start.cos, start.sin)
+    return pose, Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin), ahead, ahead / whole
+
+
+def arrived(push: SteppedPush, params: Any, k: jax.Array, _: Any) -> jax.Array:
+    _, job, _, length = params
+    return k * push.substep * job.bed.spacing >= length
 
 
 def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> State:

@@ -5,6 +5,7 @@ from functools import cache, partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.batch import on_all_cores, wide_vectors
@@ -267,7 +268,12 @@ def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: _Rules)
 def _step_chunks(fixed: tuple[Scene, _Rules], maps_and_paths: tuple[jax.Array, jax.Array], *, chunk: int) -> Shaped:
     scene, (push, scheme, stop) = fixed
     act_on = partial(_way(scene, push), scene, push=push)
-    pushed = jax.lax.map(lambda pair: act_on(*pair)[0], maps_and_paths, batch_size=chunk)
+    # Strokes of like length together: a chunk takes as long as its longest one.
+    run = maps_and_paths[1][:, 1] - maps_and_paths[1][:, 0]
+    order = jnp.argsort(jnp.hypot(run[:, 0], run[:, 1]))
+    some = jax.tree.map(lambda x: x[order], maps_and_paths)
+    pushed = jax.lax.map(lambda pair: act_on(*pair)[0], some, batch_size=chunk)
+    pushed = jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x, unique_indices=True), pushed)
     return _both(pushed, relax_batch((scene, scheme, stop, Whole()), pushed.height, chunk=chunk))
 
 
