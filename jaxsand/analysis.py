@@ -1,5 +1,5 @@
 """The analysis of arXiv:1908.02745 once more: sweeps against flow rate and resolution, and what looking only where sand
-moves could save. And the push: its error against its run time."""
+moves could save."""
 
 import math
 import os
@@ -16,15 +16,11 @@ import numpy as np
 from jaxsand.bed import at, halo, largest, prepare, quantum
 from jaxsand.flux import Nothing
 from jaxsand.plain import settle_numpy
-from jaxsand.push import SteppedPush
 from jaxsand.rules import UntilStill
 from jaxsand.scene import Scene, make_scene
 from jaxsand.schemes import Relaxation
 from jaxsand.settling import relax, settle, settle_batch
-from jaxsand.sim import step_batch
-from jaxsand.swath import SwathPush
 from jaxsand.sweep import Flow, sweep
-from jaxsand.tool import Blade
 from jaxsand.workprec import COLUMN, RIDGE, distance, trench
 
 Tell = Callable[[str], None]
@@ -176,44 +172,3 @@ def peer(batch: int = 256, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
         row["times_numpy"] = seconds / row["seconds"]
         row["times_reported"] = 0.33 / row["seconds"]
     return rows
-
-
-def push_precision(batch: int = 64, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
-    """Random pushes of the default blade by sub-step and sweeps: `error` is sum |h - h_ref| / sum |h_ref| after settling,
-    against sub-steps of 1/8 with 128 sweeps each."""
-    scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
-    strokes = random_strokes(batch)
-    level = jnp.zeros((batch, 32, 32), jnp.float32)
-    run = partial(step_batch, scene, level, strokes)
-    tell("reference push")
-    best = np.asarray(run(push=SteppedPush(1 / 8, 128)).height, float)
-    ways: list[SteppedPush | SwathPush] = [SteppedPush(s, n) for s in (1.0, 0.5, 0.25, 0.125) for n in (2, 8, 32)]
-    rows = []
-    for push in (*ways, SwathPush()):
-        name = f"sub-step {push.substep:g}, {push.sweeps} sweeps" if isinstance(push, SteppedPush) else "swath"
-        tell(f"push: {name}")
-        height = np.asarray(run(push=push).height, float)
-        seconds = _best(partial(run, push=push), 3)
-        error = np.abs(height - best).sum() / np.abs(best).sum()
-        rows.append({"name": name, "error": float(error), "pushes_per_second": batch / seconds})
-    return rows
-
-
-def push_against_spacing(tell: Tell = lambda _: None, batch: int = 16) -> list[dict[str, Any]]:
-    """The same pushes on finer grids, averaged over the cells of the coarsest, against the finest; with the fitted order."""
-    maps = {}
-    for n in (16, 32, 64, 128):
-        tell(f"push on {n} cells")
-        scene = make_scene((n, n), 0.32 / n, _ANGLE, tool=Blade(width=0.06, thickness=0.03, depth=0.02))
-        level = jnp.zeros((batch, n, n), jnp.float32)
-        h = np.asarray(step_batch(scene, level, random_strokes(batch), push=SteppedPush(0.5, 32)).height, float)
-        maps[n] = h.reshape(batch, 16, n // 16, 16, n // 16).mean((2, 4))
-    sides = (16, 32, 64)
-    errors = [float(np.abs(maps[n] - maps[128]).sum() / np.abs(maps[128]).sum()) for n in sides]
-    order = -float(np.polyfit(np.log(sides), np.log(errors), 1)[0])
-    return [{"cells": n, "error": e, "fitted_order": order} for n, e in zip(sides, errors, strict=True)]
-
-
-def random_strokes(batch: int, side: float = 0.32) -> jax.Array:
-    """Strokes between points of the middle four fifths of the map (m)."""
-    return jax.random.uniform(jax.random.key(0), (batch, 4), jnp.float32, minval=0.1 * side, maxval=0.9 * side)

@@ -26,26 +26,23 @@ from jaxsand import (
     expansions,
     gradbench,
     piles,
+    pushbench,
     rutbench,
     sandbench,
     stability,
     strokebench,
     workprec,
 )
-from jaxsand.analysis import random_strokes
 from jaxsand.batch import cores
 from jaxsand.files import as_table
 from jaxsand.letterbench import bench_letters
 from jaxsand.plain import compile_c, settle_numpy
-from jaxsand.push import SteppedPush
 from jaxsand.rules import Sweeps, UntilStill
 from jaxsand.scene import Scene, make_scene
 from jaxsand.schemes import Relaxation, SuperTimeStepping
 from jaxsand.settling import Settled, settle, settle_batch
-from jaxsand.sim import act, step, step_batch
-from jaxsand.swath import SwathPush
+from jaxsand.sim import act
 from jaxsand.tool import Blade
-from jaxsand.window import Window
 
 Tell = Callable[[str], None]
 _CELLS = 32
@@ -86,10 +83,11 @@ def bench(
             report["activity"] = [analysis.activity()]
             report["piles"] = piles.piles(tell, grids + 1)
     if what in ("push", "all"):
-        report["push"] = bench_push(max(1, batch // 4), tell)
+        report["push"] = pushbench.push_speed(max(1, batch // 4), tell)
         if grids:
-            report["push_precision"] = analysis.push_precision(max(1, batch // 64), tell)
-            report["push_by_spacing"] = analysis.push_against_spacing(tell)
+            report["push_precision"] = pushbench.push_precision(max(1, batch // 256), tell)
+            report["push_heaps"] = pushbench.heaps(tell=tell)
+            report["push_by_spacing"] = pushbench.push_against_spacing(tell)
     if what in ("plan", "all"):
         report |= complexity.planning(tell)
         report["expansions"] = expansions.rows_of_expansions(tell)
@@ -197,49 +195,6 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
     return rows
 
 
-def bench_push(batch: int, tell: Tell = lambda _: None, sample: int = 64) -> list[dict[str, Any]]:
-    """Random pushes of the default blade on level sand.
-
-    `error` is sum |h - h_ref| / sum |h_ref| over the first maps, against 64 sweeps to each quarter of a spacing.
-    """
-    scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
-    near = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade(), window=Window((16, 16)))
-    level, strokes = jnp.zeros((batch, _CELLS, _CELLS), jnp.float32), random_strokes(batch)
-    vmapped = jax.jit(jax.vmap(partial(step, scene)))
-    alone = jax.jit(partial(step, scene))
-    sample = min(sample, batch)
-    few = min(16, sample)
-
-    def batched(sand: Scene, push: SteppedPush | SwathPush | None = None) -> Way:
-        return Way(lambda: (None, step_batch(sand, level, strokes, push=push).height[:sample]), batch, cores())
-
-    ways = {
-        "step_batch": batched(scene),
-        "step_batch, 2 sweeps": batched(scene, SteppedPush(0.5, 2)),
-        "step_batch, 32 sweeps": batched(scene, SteppedPush(0.5, 32)),
-        "step_batch, sub-step 1/4": batched(scene, SteppedPush(0.25, 8)),
-        "step_batch, sub-step 1": batched(scene, SteppedPush(1.0, 8)),
-        "step_batch, window 16 x 16": batched(near),
-        "step_batch, swath": batched(scene, SwathPush()),
-        "vmap(step)": Way(lambda: (None, vmapped(level, strokes).height[:sample]), batch, cores()),
-        "step, one map at a time": Way(lambda: (None, jnp.stack([alone(level[0], s).height for s in strokes[:few]])), few),
-    }
-    best = np.asarray(step_batch(scene, level[:sample], strokes[:sample], push=SteppedPush(0.25, 64)).height, float)
-    rows = []
-    for name, (seconds, first, (_, maps)) in _race(ways, tell).items():
-        against = best[: len(maps)]
-        rows.append(
-            {
-                "name": name,
-                "error": float(np.abs(np.asarray(maps, float) - against).sum() / np.abs(against).sum()),
-                "pushes_per_second": ways[name].maps / seconds,
-                "seconds": seconds,
-                "compile_seconds": max(0.0, first - seconds),
-            }
-        )
-    return rows
-
-
 def table(report: dict[str, Any]) -> str:
     """The report as text."""
     lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
@@ -278,7 +233,7 @@ def _pushed(batch: int) -> tuple[Scene, jax.Array]:
     scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
     level = jnp.zeros((_CELLS, _CELLS), jnp.float32)
     pushed = jax.jit(lambda s: jax.lax.map(lambda one: act(scene, level, one).height, s, batch_size=64))(
-        random_strokes(batch)
+        pushbench.random_strokes(batch)
     )
     return make_scene((_CELLS, _CELLS), _SPACING, _ANGLE), jax.block_until_ready(pushed)
 

@@ -1,10 +1,10 @@
 """What a blade does to the sand in a block around it: it clears what it newly covers, and keeps what is ahead of it there.
 
 A blade stands in the sand as a prism over its footprint, from its bottom up. Where it covers the share a of a cell, that
-cell's sand above the bottom lies in the open share 1 - a. Whenever a grows to b, the share (b - a) / (1 - a) of that sand has
-to leave. It goes one cell on along the face's normal, to the one or two of the eight neighbours that lie there, shared as
-the normal divides the angle between them; where no cell is there (a wall, a closed edge, a rim above the sand) it stays in
-its column, inside the blade, and flows off when the blade has gone.
+cell's sand above the bottom lies in the open share 1 - a. Whenever a grows to b, the share (b - a) / (1 - a) of that sand
+has to leave. It goes one cell on along the face's normal, to the one or two of the eight neighbours that lie there, shared
+as the normal divides the angle between them; where no cell is there (a wall, a closed edge, a rim above the sand) it stays
+in its column, inside the blade, and flows off when the blade has gone.
 
 A blade is a wall. Its middle plane, as wide as it is, cuts every link whose ends lie on its two sides; a cell through whose
 centre the plane passes is covered to the plane's own share, since a blade is at least a cell thick. So no link between front
@@ -29,8 +29,9 @@ Shares = dict[tuple[int, int], jax.Array]
 
 @dataclass(frozen=True)
 class Reach:
-    """Which share of each cell a blade covers before and after it moves, and at any time on the way; the share of each that
-    lies `beside` no end of it; and `along`, how far ahead of its middle plane the cell is afterwards. All in a block's halo."""
+    """Which share of each cell a blade covers before and after it moves, and at any time on the way; the share of each
+    that lies between its ends, `beside`; and `along`, how far ahead of its middle plane the cell is afterwards. All in a
+    block's halo."""
 
     before: jax.Array
     swept: jax.Array
@@ -51,8 +52,8 @@ def _to(s: jax.Array) -> jax.Array:
 def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Array) -> Reach:
     """A blade of half the thickness `half` (spacings) that moves ahead.
 
-    What it covers is the product of two intervals, along and across, each smoothed over one spacing: exact for headings along
-    the grid, a first-order approximation otherwise; continuous and piecewise linear.
+    What it covers is the product of two intervals, along and across, each smoothed over one spacing: exact for headings
+    along the grid, a first-order approximation otherwise; continuous and piecewise linear.
     """
     rear, front, front_after = _to(along + half), _to(along - half), _to(along - half - ahead)
     after = _to(along + half - ahead) - front_after

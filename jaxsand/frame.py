@@ -4,7 +4,8 @@ Mirrors and a swap of the axes take any heading into the first octant, where a s
 block is fetched from the map in that frame, cell by cell, and set back the same way; what of it lies off the map is void.
 
 Maps here are [H, W] or, for a batch, [H, W, B], and what belongs to one map is a number or [B]: arithmetic broadcasts from
-the right, and a batch is computed with its maps in the lanes of the vector unit. In flat maps the cells are one axis, by rows.
+the right, and a batch is computed with its maps in the lanes of the vector unit. In flat maps the cells are one axis, by
+rows.
 """
 
 from dataclasses import dataclass, field

@@ -131,12 +131,18 @@ def _trailing(program: Callable, loop: Lanes, size: int, mapped: list, args: Tre
     chunk = -(-size // chunks)
 
     def some(part: list) -> Tree:
-        own, last = iter(part), []
-        for x, y in zip(leaves, yes, strict=True):
-            x = jnp.moveaxis(next(own), 0, -1) if y else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), chunk))
-            last.append(x.reshape(*x.shape[:-2], loop.width * chunk) if loop.width else x)
-        params, rest = jax.tree.unflatten(tree, last)
-        out = batched(program, replace(loop, width=max(loop.width, 1) * chunk), params, *rest)
+        own = iter(part)
+
+        def last(x: jax.Array, batched: bool) -> jax.Array:
+            if batched:
+                x = jnp.moveaxis(next(own), 0, -1)
+            else:
+                x = jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), chunk))
+            return x.reshape(*x.shape[:-2], loop.width * chunk) if loop.width else x
+
+        params, rest = jax.tree.unflatten(tree, [last(x, y) for x, y in zip(leaves, yes, strict=True)])
+        with jax.numpy_rank_promotion("allow"):  # what belongs to one map, [B], meets maps [m, m, B]: that is the layout
+            out = batched(program, replace(loop, width=max(loop.width, 1) * chunk), params, *rest)
         if loop.width:
             out = jax.tree.map(lambda x: x.reshape(*x.shape[:-1], loop.width, chunk), out)
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), out)

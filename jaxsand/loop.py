@@ -30,15 +30,15 @@ class Step(Protocol):
     def tape(self) -> int:
         """How many records are kept at hand; of a longer loop the earlier ones are restored."""
 
-    def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree: ...
+    def __call__(self, params: Tree, k: jax.Array, state: Tree, /) -> Tree: ...
 
-    def recorded(self, params: Tree, k: jax.Array, state: Tree) -> tuple[Tree, Tree]:
+    def recorded(self, params: Tree, k: jax.Array, state: Tree, /) -> tuple[Tree, Tree]:
         """The state after step k, and what its derivative needs."""
 
-    def push(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree) -> Tree:
+    def push(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree, /) -> Tree:
         """The tangent of the state after the step."""
 
-    def pull(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+    def pull(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree, /) -> tuple[Tree, Tree]:
         """The cotangents of params and of the state before the step."""
 
 

@@ -3,8 +3,9 @@
 The quasi-static limit is that of a tool so slow that the sand is always at rest. The blade advances by sub-steps of a fixed
 part of a spacing; after each, what it newly covers has left along its face's normal (blade.py) and the sand is brought to
 rest around it (resting.py). When it is lowered, what it covers leaves radially: away from its centre in the blade's own
-proportions, along the gradient of (s / thickness)^2 + (n / width)^2 with s along and n across the blade. At a corner it turns
-in place, by the smaller angle, in sub-steps of an angle; what it sweeps leaves along its faces.
+proportions, along the gradient of (s / thickness)^2 + (n / width)^2 with s along and n across the blade. At a corner it
+turns in place, by the smaller angle, in sub-steps of an angle; what it sweeps leaves along its faces. A reversal is half a
+turn, to the left.
 
 Source: arXiv:1908.02745, "Tool Interaction"; shares of a cell in place of whole ones make the result continuous in the
 stroke.
@@ -23,17 +24,18 @@ from jax import lax
 from jaxsand import blade
 from jaxsand.bed import Lost, at, halo, lose, truncate
 from jaxsand.displace import Job
-from jaxsand.flux import NARROW
+from jaxsand.flux import NARROW, Fluxes
 from jaxsand.frame import Frame, Places, corner, cut, frame_of, numbers, paste, places, shifted, shifted_back
 from jaxsand.grid import Neighbours
 from jaxsand.legs import Pushed, State, along_legs, over_the_map
 from jaxsand.loop import Plain, repeat, repeat_until, split
-from jaxsand.resting import Fluxes, Sand, bring_to_rest, bring_to_rest_and_back, moved_on, no_flux
+from jaxsand.resting import Sand, bring_to_rest, bring_to_rest_and_back, moved_on, no_flux
 from jaxsand.scene import Scene
 from jaxsand.stencil import inner, spread
 from jaxsand.tool import Pose
 from jaxsand.window import Window
 
+Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 _CELLS = 16_384  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache
 
 
@@ -88,18 +90,33 @@ class Moving:
 
 
 def push_along(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SteppedPush, record: Callable[[jax.Array], Any] | None = None
+    scene: Scene,
+    height: jax.Array,
+    path: jax.Array,
+    push: SteppedPush,
+    record: Callable[[jax.Array], Any] | None = None,
+    rest: Rest = bring_to_rest,
 ) -> tuple[Pushed, Any]:
-    """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
+    """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`.
+
+    `rest` brings the sand to rest after each sub-step (`bring_to_rest` of resting.py).
+    """
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        return _leg(scene, push, job, pose, length, before, state)
+        return _leg(scene, push, rest, job, pose, length, before, state)
 
     return along_legs(scene, height, path, push.rate, leg, record)
 
 
 def _leg(
-    scene: Scene, push: SteppedPush, job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State
+    scene: Scene,
+    push: SteppedPush,
+    rest: Rest,
+    job: Job,
+    pose: Pose,
+    length: jax.Array,
+    before: Pose | None,
+    state: State,
 ) -> State:
     """Lowers the blade, or turns it from the pose before, and moves it ahead by `length`, as far as that touches the map."""
     shape, dx, drains = scene.grid.shape, job.bed.spacing, job.bed.rim is not None
@@ -107,8 +124,8 @@ def _leg(
     block = Block(shape, size, isinstance(scene.window, Window), scene.grid.neighbours, drains)
     h, lost, moved = state
     none = no_flux(block.neighbours, drains, jnp.zeros((size, size), h.dtype))
-    flat = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
-    sand = Moving(*flat, none, moved)
+    flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
+    sand = Moving(flat, gone, none, moved)
 
     def way(pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
         drop = job.bed.drop
@@ -136,13 +153,14 @@ def _leg(
         angle = jnp.where(same, 0, jnp.arctan2(jnp.where(same, 0, sin), jnp.where(same, 1, cos)))
         turn = way(Pose(pose.x, pose.y, before.cos, before.sin), zero, angle)
         bound = math.ceil(math.pi * math.hypot(*shape) / push.substep) + 1
-        turning = _Turn(block, substep=push.substep, sweeps=push.sweeps)
+        turning = _Turn(block, substep=push.substep, sweeps=push.sweeps, rest=rest)
         sand, _ = repeat_until(turning.turned, turning, bound, turn, sand)
     start, onmap = over_the_map(scene, job, pose, length)
     # make_scene holds the thickness below the map's diagonal, so twice the diagonal is enough.
     chunk = max(1, int(1 / push.substep))
     bound = math.ceil((2 * math.hypot(*shape) + 3) / (push.substep * chunk)) + 1
-    advance = _Advance(block, substep=push.substep, sweeps=push.sweeps, chunk=chunk, lowered=before is None)
+    lowered = before is None
+    advance = _Advance(block, substep=push.substep, sweeps=push.sweeps, chunk=chunk, lowered=lowered, rest=rest)
     sand, _ = repeat_until(advance.arrived, advance, bound, way(start, onmap, zero), replace(sand, flux=none))
     h, lost = jax.tree.map(lambda x: x.reshape(shape), (sand.height, sand.lost))
     return h, lost, sand.edge
@@ -151,8 +169,9 @@ def _leg(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class View:
-    """A block of the map, [m, m]: where its cells lie; which hold sand (1 or 0, in a halo); the largest stable step (quanta);
-    over how many sides a cell drains; and, in a halo, what lies beyond a rim. The last two are None where nothing drains."""
+    """A block of the map, [m, m]: where its cells lie; which hold sand (1 or 0, in a halo); the largest stable step
+    (quanta); over how many sides a cell drains; and, in a halo, what lies beyond a rim. The last two are None where nothing
+    drains."""
 
     where: Places
     holds: jax.Array
@@ -163,7 +182,7 @@ class View:
 
 @dataclass(frozen=True)
 class Block:
-    """Which part of a map [H, W] is computed: a block of `size` squared that follows the blade, or one that holds the map."""
+    """Which part of a map [H, W] is computed: a block of `size` squared that follows the blade, or one that holds it all."""
 
     shape: tuple[int, int]
     size: int
@@ -186,7 +205,7 @@ class Block:
         if self.drains:
             rows, columns = self.shape
             edges = [where.row == 0, where.row == rows - 1, where.column == 0, where.column == columns - 1]
-            sides = sum(jnp.where(e & where.inside, 1.0, 0.0) for e in edges).astype(h.dtype)
+            sides = jnp.stack([jnp.where(e & where.inside, 1.0, 0.0) for e in edges]).sum(0).astype(h.dtype)
             beyond = halo(jnp.where(where.inside, 0.0, 1.0).astype(h.dtype), 1.0)
         view = View(where, halo(jnp.where(solid, 0.0, 1.0).astype(h.dtype), 0.0), drop / way.quantum, sides, beyond)
         return view, jnp.where(solid, 0, h)
@@ -232,7 +251,6 @@ class Block:
         bottom, level = way.bottom / way.quantum, way.level / way.quantum
         height = jnp.maximum(h - bottom, 0)
         return view.beyond, jnp.clip((h - level) / jnp.where(height > 0, height, 1), 0, 1)
-
 
     def displaced(
         self, way: Way, view: View, shares: blade.Shares, h: jax.Array, taken: jax.Array
@@ -351,6 +369,7 @@ class _Advance(_Step):
     sweeps: int = 4
     chunk: int = 8
     lowered: bool = False
+    rest: Rest = bring_to_rest
 
     def arrived(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
         return (k >= self.lowered) & jnp.all((k - self.lowered) * (self.chunk * self.substep) >= way.length)
@@ -405,7 +424,7 @@ class _Advance(_Step):
         view: View,
         i: jax.Array,
         state: tuple[jax.Array, Fluxes, jax.Array | None],
-        rest: Callable = bring_to_rest,
+        rest: Rest | None = None,
     ) -> tuple[jax.Array, Fluxes, jax.Array | None]:
         """Heights, fluxes and what was lost (quanta) after sub-step i of step k."""
         h, flux, gone = state
@@ -424,8 +443,11 @@ class _Advance(_Step):
         shares = {to: spread(part, h) for to, part in blade.onward(pose.cos, pose.sin).items()}
         h, lost = self.block.displaced(way, view, shares, h, taken)
         guess = tuple(f * jnp.where(moving, part, 0) for f in moved_on(flux, ahead * pose.cos, ahead * pose.sin))
+        rest = self.rest if rest is None else rest
         h, flux = rest(self.block.sand(way, view, reach), rate * part, self.sweeps, h, guess)
-        return h, flux, None if gone is None else gone + lost + flux[-1]
+        if gone is not None and lost is not None:
+            gone = gone + lost + flux[-1]
+        return h, flux, gone
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
         if isinstance(record, Moving):
@@ -463,7 +485,10 @@ class _Advance(_Step):
         def back(j: jax.Array, carry: Any) -> Any:
             (h, f), of_floats, of_rate, of_state = carry
             i = self.chunk - 1 - j
-            step = lambda floats, rate, h, f: inside.substep(floats, rate, i, h, f, bring_to_rest_and_back)
+
+            def step(floats: Any, rate: jax.Array, h: jax.Array, f: Fluxes) -> tuple[jax.Array, Fluxes]:
+                return inside.substep(floats, rate, i, h, f, bring_to_rest_and_back)
+
             pulled = jax.vjp(step, floats, rate, h, f)[1]
             df, dr, *of_state = pulled(of_state)
             return fetched(i - 1), jax.tree.map(jnp.add, of_floats, df), of_rate + dr, tuple(of_state)
@@ -504,7 +529,7 @@ class _Inside:
         i: jax.Array,
         h: jax.Array,
         flux: Fluxes,
-        rest: Callable = bring_to_rest,
+        rest: Rest | None = None,
     ) -> tuple[jax.Array, Fluxes]:
         way = self.merge(floats)
         return self.advance.substeps(way, rate, self.k, self.first, self._view(way), i, (h, flux, None), rest)[:2]
@@ -516,6 +541,7 @@ class _Turn(_Step):
 
     substep: float = 0.125
     sweeps: int = 4
+    rest: Rest = bring_to_rest
 
     def turned(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
         return jnp.all(k * self._part(way) >= jnp.abs(way.angle))
@@ -542,12 +568,10 @@ class _Turn(_Step):
         face = blade.facing(at(now[1]), sign * ahead) / jnp.maximum(jnp.abs(pose.cos), jnp.abs(pose.sin))
         h, lost = self.block.displaced(way, view, blade.any_way(face * pose.cos, face * pose.sin), old, taken)
         guess = tuple(f * part for f in sand.flux)
-        new, flux = bring_to_rest(self.block.sand(way, view, reach), way.rate * near * part, self.sweeps, h, guess)
+        new, flux = self.rest(self.block.sand(way, view, reach), way.rate * near * part, self.sweeps, h, guess)
         gone = None if lost is None else lost + flux[-1]
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))
-        return Moving(
-            self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge
-        )
+        return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
 
 
 def _rotated(pose: Pose, angle: jax.Array) -> Pose:

@@ -10,10 +10,11 @@ the steps over links, proximal gradient steps
 
     f <- S(f + r w D (h + G f), r w m),   S(z, t) = z - clip(z, -t, t)
 
-lead there from any start, since r w is below 2 / |G|^2 (the limit of a sweep of settling). Unlike a sweep of settling, such a step takes back what has crossed a link too
-many times. That allows a good guess to begin with: around a tool the sand moves as it did a moment ago, a little farther
-ahead. So every sub-step starts from the fluxes of the last one, moved on with the tool, and a few steps suffice, however far
-the heap reaches. Isotropic sand has a flux along each of the four one-sided gradients of a cell, which S shortens to length.
+lead there from any start, since r w is below 2 / |G|^2 (the limit of a sweep of settling). Unlike a sweep of settling,
+such a step takes back what has crossed a link too many times. That allows a good guess to begin with: around a tool the sand moves
+as it did a moment ago, a little farther ahead. So every sub-step starts from the fluxes of the last one, moved on with the
+tool, and a few steps suffice, however far the heap reaches. Isotropic sand has a flux along each of the four one-sided
+gradients of a cell, which S shortens to length.
 
 The weight w of a link is how open it is. A cell of which the share o is open rises by 1 / o of what it gains, so that steps
 are stable if for every f the sum over cells of (sum of f)^2 / o is at most 2 sum of f^2 / (r w); with n links to a cell, all
@@ -86,8 +87,7 @@ def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess:
     model = _Gradients(sand, rate) if sand.neighbours == "isotropic" else _Links.of(sand, rate)
 
     def stage(_: jax.Array, flux: Fluxes) -> Fluxes:
-        # All that is the same for every step goes through the barrier too: XLA would compute more of it beforehand, and store
-        # that.
+        # All that is the same for every step goes through the barrier too: XLA would compute more beforehand, and store it.
         here, flux = lax.optimization_barrier((model, flux))
         return lax.optimization_barrier(here.shrink(flux, here.sand.surface(h + here.gained(flux))))
 
@@ -143,7 +143,7 @@ def _rest_back(sweeps: int, kept: Any, cotangent: Any) -> tuple[Any, ...]:
         return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, k, 0, keepdims=False), tape)
 
     def stage(j: jax.Array, carry: Any) -> Any:
-        # The fluxes are part of what is carried: XLA would fetch them anew for all that uses them. Maps in a halo are stored.
+        # The fluxes are part of what is carried: XLA would fetch them anew for all that uses them.
         flux, gain, psi, felt, signs, of_stretch, lift = carry
         here, gain, psi = lax.optimization_barrier((model, gain, psi))
         s = outer(here.sand.surface(h + here.gained(flux)))
@@ -169,13 +169,13 @@ def _rest_back(sweeps: int, kept: Any, cotangent: Any) -> tuple[Any, ...]:
     carry = (fetched(jnp.int32(sweeps - 1)), gain, psi, none, none, nothing, nothing)
     _, gain, psi, felt, signs, of_stretch, lift = lax.fori_loop(0, sweeps, stage, carry)
     weights = tuple(y - z * (sand.drop * length) for y, z, length in zip(felt, signs, lengths, strict=True))
-    tilt = sum(total(z * w) * length for z, w, length in zip(signs, model.weights, lengths, strict=True))
+    tilts = [total(z * w) * length for z, w, length in zip(signs, model.weights, lengths, strict=True)]
     of_sand = Sand(
         tuple(w * (model.rate / length) for w, length in zip(weights, lengths, strict=True)),
         nothing,
         of_stretch,
         -total(lift * sand.stretch),
-        -tilt,
+        -sum(tilts, jnp.zeros_like(sand.drop)),
         None,
         None,
         neighbours,

@@ -29,9 +29,7 @@ def steps(neighbours: Neighbours, s: jax.Array) -> Fluxes:
 
 def net(neighbours: Neighbours, flux: Fluxes) -> jax.Array:
     """What each cell receives over links, whose flux goes to the first cell, less what it gives."""
-    return _linear(
-        lambda f: received(neighbours, f), lambda y: tuple(-d for d in _steps(neighbours, y)), tuple(flux)
-    )
+    return _linear(lambda f: received(neighbours, f), lambda y: tuple(-d for d in _steps(neighbours, y)), tuple(flux))
 
 
 def neighbour(x: jax.Array, di: int, dj: int) -> jax.Array:

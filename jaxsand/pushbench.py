@@ -1,0 +1,256 @@
+"""How close the push comes to its quasi-static limit, and how fast.
+
+The limit is that of sub-steps going to 0 with the sand fully at rest after each, in float64. It is taken in two ways that
+have nothing in common but the blade: by the proximal steps of resting.py, many of them to each short sub-step, and by the
+paper's sweeps, each sub-step swept until no slope exceeds repose. What the two, and two lengths of the sub-step, differ by
+is the limit's own uncertainty. A blade as wide as its bed has an exact limit: what it cut stands ahead as a triangle at
+repose.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxsand.bed import truncate
+from jaxsand.flux import Fluxes
+from jaxsand.grid import links
+from jaxsand.push import SteppedPush, push_along
+from jaxsand.resting import Sand, no_flux
+from jaxsand.scene import Scene, cast, fit, make_scene
+from jaxsand.settling import settle, settle_batch
+from jaxsand.sim import follow_frames, step, step_batch
+from jaxsand.stencil import net, steps
+from jaxsand.swath import SwathPush
+from jaxsand.tool import Blade
+
+Tell = Callable[[str], None]
+_ANGLE = math.radians(29)
+_STILL = 1e-4  # a slope (a tangent) at which the limit's sand counts as at rest
+_ROUNDS = 3
+_WAYS = tuple(SteppedPush(a, n) for a, n in ((1.0, 8), (0.5, 8), (0.25, 4), (0.25, 8), (0.125, 2), (0.125, 4), (0.125, 8)))
+_FINER = (SteppedPush(1 / 16, 2), SteppedPush(1 / 16, 4), SteppedPush.fine(), SteppedPush(1 / 32, 16))
+
+
+def random_strokes(batch: int, side: float = 0.32) -> jax.Array:
+    """Strokes between points of the middle four fifths of the map (m)."""
+    return jax.random.uniform(jax.random.key(0), (batch, 4), jnp.float32, minval=0.1 * side, maxval=0.9 * side)
+
+
+def surfaces(scene: Scene, batch: int) -> dict[str, np.ndarray]:
+    """Maps [B, H, W] (m) at rest to push into: level sand, sand with a trench in it, and rough sand of 10 mm relief."""
+    rows, columns = scene.grid.shape
+    level = np.zeros((batch, rows, columns))
+    dx = float(scene.grid.spacing)
+    across = [0.25 * columns * dx, 0.5 * rows * dx, 0.75 * columns * dx, 0.5 * rows * dx]
+    trenched = np.asarray(step(scene, level[0], np.array(across)).height)
+    waves = np.random.default_rng(0).normal(size=(batch, 6, 6))
+    rough = np.asarray(jax.image.resize(jnp.asarray(waves), (batch, rows, columns), "cubic"))
+    rough = 0.01 * rough / (rough.max((1, 2)) - rough.min((1, 2)))[:, None, None]
+    return {
+        "level": level,
+        "trenched": np.repeat(trenched[None], batch, 0),
+        "rough": np.asarray(settle_batch(scene, rough).height),
+    }
+
+
+def push_precision(batch: int = 16, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """Random pushes of the default blade on 32 x 32 cells, by sub-step and sweeps, on `surfaces`.
+
+    `error` is the mean distance from the limit over the mean change that the limit makes, after settling; `worst` the same
+    of the worst map; `dug_error` and `berm_error` compare the volume below and the height above the start. The rows named
+    "limit" say how uncertain that is. `fitted_order` is that of the sub-step, at 8 sweeps and more.
+    """
+    rows: list[dict[str, Any]] = []
+    with jax.enable_x64(True):
+        scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
+        strokes = np.tile(np.asarray(random_strokes(batch), float), (3, 1))
+        starts = np.concatenate(list(surfaces(scene, batch).values()))
+        limits = []
+        for name, run in (
+            ("proximal steps, sub-step 1/64", partial(_batch, push=SteppedPush(1 / 64, 32))),
+            ("proximal steps, sub-step 1/128", partial(_batch, push=SteppedPush(1 / 128, 32))),
+            ("the paper's sweeps until still, sub-step 1/64", partial(_relaxed, substep=1 / 64)),
+        ):
+            tell(f"limit: {name}")
+            limits.append((name, run(scene, starts, strokes)))
+        best = limits[1][1]
+        rows += [{"name": f"limit: {name}", **_apart(h, best, starts)} for name, h in limits if h is not best]
+    starts32, strokes32 = starts.astype(np.float32), strokes.astype(np.float32)
+    errors = []
+    ways: list[SteppedPush | SwathPush] = [*_WAYS, *_FINER, SwathPush()]
+    for push in ways:
+        name = f"sub-step {push.substep:g}, {push.sweeps} sweeps" if isinstance(push, SteppedPush) else "swath"
+        tell(f"push: {name}")
+        found = _apart(_batch(scene, starts32, strokes32, push=push), best, starts)
+        if isinstance(push, SteppedPush) and push.sweeps >= 8:
+            errors.append((push.substep, found["error"]))
+        rows.append({"name": name, **found})
+    sizes, distances = np.log(np.array(errors)).T
+    order = float(np.polyfit(sizes, distances, 1)[0])
+    return [row | {"fitted_order": order} for row in rows]
+
+
+def push_speed(batch: int, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """Random pushes of the default blade on level sand of 32 x 32 cells: pushes a second, the ways taking turns."""
+    scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
+    level, strokes = jnp.zeros((batch, 32, 32), jnp.float32), random_strokes(batch)
+    vmapped = jax.jit(jax.vmap(partial(step, scene)))
+    few = strokes[:16]
+    ways: dict[str, tuple[int, Callable[[], Any]]] = {
+        f"step_batch, sub-step {p.substep:g}, {p.sweeps} sweeps": (batch, partial(step_batch, scene, level, strokes, push=p))
+        for p in (SteppedPush(), SteppedPush(0.25, 4), SteppedPush(1 / 16, 2), SteppedPush(1 / 16, 4), SteppedPush.fine())
+    }
+    ways["step_batch, swath"] = (batch, partial(step_batch, scene, level, strokes, push=SwathPush()))
+    ways["vmap(step)"] = (batch, lambda: vmapped(level, strokes))
+    ways["step, one map at a time"] = (len(few), lambda: [step(scene, level[0], s) for s in few])
+    first, best = {}, dict.fromkeys(ways, math.inf)
+    for turn in range(_ROUNDS + 1):
+        for name, (_, run) in ways.items():
+            tell(f"{name}, turn {turn}")
+            began = time.perf_counter()
+            jax.block_until_ready(run())
+            seconds = time.perf_counter() - began
+            if turn:
+                best[name] = min(best[name], seconds)
+            else:
+                first[name] = seconds
+    return [
+        {
+            "name": name,
+            "pushes_per_second": many / best[name],
+            "seconds": best[name],
+            "compile_seconds": max(0.0, first[name] - best[name]),
+        }
+        for name, (many, _) in ways.items()
+    ]
+
+
+def push_against_spacing(tell: Tell = lambda _: None, batch: int = 8) -> list[dict[str, Any]]:
+    """The same pushes of a blade of 60 x 30 mm, 20 mm deep, on finer grids, averaged over the cells of the coarsest, against
+    the finest; with the fitted order."""
+    maps = {}
+    for n in (16, 32, 64, 128):
+        tell(f"push on {n} cells")
+        scene = make_scene((n, n), 0.32 / n, _ANGLE, tool=Blade(width=0.06, thickness=0.03, depth=0.02))
+        level = np.zeros((batch, n, n), np.float32)
+        h = _batch(scene, level, np.asarray(random_strokes(batch)), push=SteppedPush())
+        maps[n] = h.reshape(batch, 16, n // 16, 16, n // 16).mean((2, 4))
+    sides = (16, 32, 64)
+    errors = [float(np.abs(maps[n] - maps[128]).sum() / np.abs(maps[128]).sum()) for n in sides]
+    order = -float(np.polyfit(np.log(sides), np.log(errors), 1)[0])
+    return [{"cells": n, "error": e, "fitted_order": order} for n, e in zip(sides, errors, strict=True)]
+
+
+def heaps(
+    spacings_mm: tuple[float, ...] = (10, 5, 2.5, 1.25), push: SteppedPush | None = None, tell: Tell = lambda _: None
+) -> list[dict[str, Any]]:
+    """The heap ahead of a blade as wide as its bed, against the triangle: 20 mm thick, 12 mm deep, 16 cm far, 31 degrees.
+
+    `error` is the distance from the triangle's cell means, in the cells wholly ahead of the face, over its volume; `peak`
+    and `volume` are shares of the triangle's.
+    """
+    rows = []
+    for dx in spacings_mm:
+        tell(f"heap on cells of {dx:g} mm")
+        rows.append(heap(dx / 1000, SteppedPush() if push is None else push))
+    return rows
+
+
+def heap(
+    dx: float,
+    push: SteppedPush,
+    *,
+    depth: float = 0.012,
+    way: float = 0.16,
+    angle: float = math.radians(31),
+    thickness: float = 0.02,
+) -> dict[str, Any]:
+    """One heap (lengths in m): V = depth (way + thickness / 2) to a unit of width, peak sqrt(2 mu V), toe sqrt(2 V / mu)."""
+    mu = math.tan(angle)
+    volume = depth * (way + thickness / 2)
+    peak, toe = math.sqrt(2 * mu * volume), math.sqrt(2 * volume / mu)
+    margin = 2 * thickness + math.sqrt(depth * thickness / mu)
+    columns = math.ceil((2 * margin + way + 1.3 * toe) / dx)
+    scene = make_scene((3, columns), dx, angle, tool=Blade(columns * dx, thickness, depth))
+    path = np.array([[margin, 1.5 * dx], [margin + way, 1.5 * dx]])
+    _, frames = follow_frames(scene, np.zeros((3, columns), np.float32), path, push=push)
+    h = np.asarray(frames[-1][1], float)
+    edges = np.arange(columns + 1) * dx - (margin + way + thickness / 2)
+    inside = np.clip(edges, 0, toe)
+    exact = np.diff(inside * peak - mu * inside**2 / 2) / dx
+    ahead = edges[:-1] >= -1e-6 * dx
+    return {
+        "spacing_mm": 1000 * dx,
+        "toe_cells": toe / dx,
+        "error": float(np.abs(h - exact)[ahead].sum() * dx / volume),
+        "peak": float(h.max() / peak),
+        "volume": float(h[ahead].sum() * dx / volume),
+    }
+
+
+def _batch(scene: Scene, starts: np.ndarray, strokes: np.ndarray, *, push: SteppedPush | SwathPush) -> np.ndarray:
+    return np.asarray(step_batch(scene, starts, strokes, push=push).height, float)
+
+
+def _apart(h: np.ndarray, best: np.ndarray, start: np.ndarray) -> dict[str, float]:
+    def share(x: np.ndarray, y: np.ndarray) -> float:
+        return float(np.abs(x - y).sum() / np.abs(y).sum())
+
+    each = np.abs(h - best).sum((1, 2)) / np.abs(best - start).sum((1, 2))
+    dug = [np.minimum(x - start, 0).sum((1, 2)) for x in (h, best)]
+    berm = [(x - start).max((1, 2)) for x in (h, best)]
+    return {
+        "error": float(np.abs(h - best).sum() / np.abs(best - start).sum()),
+        "worst": float(each.max()),
+        "dug_error": share(*dug),
+        "berm_error": share(*berm),
+    }
+
+
+def _relaxed(scene: Scene, starts: np.ndarray, strokes: np.ndarray, *, substep: float) -> np.ndarray:
+    """Pushes whose every sub-step is swept by the paper's scheme until still."""
+    maps = jnp.asarray(starts)
+    scene, _ = fit(scene, maps[0])
+    push = cast(SteppedPush(substep, 8, 0.125), maps.dtype)
+
+    @jax.jit
+    def run(maps: jax.Array, paths: jax.Array) -> jax.Array:
+        return jax.vmap(lambda h, path: push_along(scene, h, path, push, rest=_swept)[0].height)(maps, paths)
+
+    order = np.argsort(np.hypot(*(strokes[:, 2:] - strokes[:, :2]).T))
+    out = np.empty_like(starts)
+    for group in np.array_split(order, max(1, len(order) // 16)):
+        after = run(maps[group], jnp.asarray(strokes[group]).reshape(-1, 2, 2))
+        out[group] = np.asarray(jax.vmap(partial(settle, scene))(after).height)
+    return out
+
+
+def _swept(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
+    """In place of `bring_to_rest`: the paper's sweeps, behind the same gates, until no slope exceeds repose."""
+    gates = list(zip(sand.gates, links(sand.neighbours), strict=True))
+
+    def excess(h: jax.Array) -> Iterator[jax.Array]:
+        for (gate, (_, _, length)), d in zip(gates, steps(sand.neighbours, sand.surface(h)), strict=True):
+            most = sand.drop * length
+            yield (d - jnp.clip(d, -most, most)) * (gate / length)
+
+    def moving(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
+        h, k = carry
+        worst = jnp.max(jnp.stack([jnp.max(jnp.abs(e) * (rate > 0)) for e in excess(h / jnp.max(sand.drop))]))
+        return (worst > _STILL) & (k < 4000)
+
+    def some(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        h, k = carry
+        for _ in range(sweeps):
+            h = h + net(sand.neighbours, tuple(truncate(e * rate) for e in excess(h)))
+        return h, k + sweeps
+
+    h, _ = lax.while_loop(moving, some, (h, jnp.int32(0)))
+    return h, no_flux(sand.neighbours, False, h)
