@@ -6,13 +6,14 @@ on. So a slow map costs its own sweeps, not those of its neighbours, and every m
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxsand.bed import Lost
@@ -116,6 +117,20 @@ def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int
             outs = list(pool.map(part, parts))
         out = jax.tree.map(lambda *x: jnp.concatenate(x), *outs)
     return jax.tree.map(lambda x: x[:total], out) if extra else out
+
+
+def in_turns(runs: Sequence[Callable[[Any], Tree]], flagged: Callable[[Tree], jax.Array]) -> Tree:
+    """The batch of the first run, `runs[0](which)`; what is flagged in it comes from the second, and so on."""
+    out = runs[0](slice(None))
+    for run in runs[1:]:
+        left = np.flatnonzero(flagged(out))
+        if not left.size:
+            break
+        # Batches of a few sizes, so that few programs are compiled.
+        size = 8 ** math.ceil(math.log(max(left.size, 8), 8))
+        again = run(np.resize(left, min(size, jax.tree.leaves(out)[0].shape[0])))
+        out = jax.tree.map(lambda x, y, left=left: x.at[left].set(y[: left.size]), out, again)
+    return out
 
 
 def cores() -> int:

@@ -11,9 +11,9 @@ the steps over links, proximal gradient steps
     f <- S(f + r w D (h + G f), r w m),   S(z, t) = z - clip(z, -t, t)
 
 lead there from any start, since r w is below 2 / |G|^2 (the limit of a sweep of settling). Unlike a sweep of settling,
-such a step takes back what has crossed a link too many times. That allows a good guess to begin with: around a tool the sand moves
-as it did a moment ago, a little farther ahead. So every sub-step starts from the fluxes of the last one, moved on with the
-tool, and a few steps suffice, however far the heap reaches. Isotropic sand has a flux along each of the four one-sided
+such a step takes back what has crossed a link too many times. That allows a good guess to begin with: around a tool the sand
+moves as it did a moment ago, a little farther ahead. So every sub-step starts from the fluxes of the last one, moved on with
+the tool, and a few steps suffice, however far the heap reaches. Isotropic sand has a flux along each of the four one-sided
 gradients of a cell, which S shortens to length.
 
 The weight w of a link is how open it is. A cell of which the share o is open rises by 1 / o of what it gains, so that steps

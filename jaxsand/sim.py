@@ -1,7 +1,5 @@
 """The simulator: a tool acts, the sand settles."""
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -10,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.batch import on_all_cores, wide_vectors
+from jaxsand.batch import in_turns, on_all_cores, wide_vectors
 from jaxsand.legs import Pushed
-from jaxsand.push import SteppedPush, push_along
+from jaxsand.push import SteppedPush, push_along, windows_for
 from jaxsand.roll import roll_along
 from jaxsand.rules import Outcome, Stop, as_batch, check_chunk, check_rate, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
@@ -21,7 +19,7 @@ from jaxsand.settling import Settled, relax, relax_batch
 from jaxsand.split import SplitPush, push_split
 from jaxsand.swath import SwathPush, push_swath
 from jaxsand.tool import Blade, NoTool, Pose, Wheel
-from jaxsand.window import Whole, Window
+from jaxsand.window import Whole
 
 Push = SteppedPush | SwathPush | SplitPush
 _PUSHES: dict[tuple[type, type], Any] = {
@@ -97,8 +95,8 @@ def follow(
     scene, height, rules = _ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
     if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, height, path, rules))):
-        for near in _windows(scene, rules[0], 4):
-            out = _follow(near, height, path, rules)[0]
+        for part in windows_for(scene, rules[0], 4):
+            out = _follow(part, height, path, rules)[0]
             if not int(out.outcome) & Outcome.WINDOW_EDGE:
                 return out
     return _follow(scene, height, path, rules)[0]
@@ -159,46 +157,8 @@ def step_batch(
     def run(scene: Scene, who: np.ndarray | slice) -> Shaped:
         return on_all_cores(_step_program(), (scene, rules), (height[who], stroke[who].reshape(-1, 2, 2)), chunk)
 
-    windows = list(_windows(scene, rules[0], 1.5))
-    if not windows:
-        return run(scene, slice(None))
-    out = run(windows[0], slice(None))
-    for wider in (*windows[1:], scene):
-        left = np.flatnonzero(np.asarray(out.outcome) & Outcome.WINDOW_EDGE)
-        if not left.size:
-            break
-        # Batches of a few sizes, so that a scene compiles a few programs.
-        filled = np.resize(left, min(len(out.outcome), 8 ** math.ceil(math.log(max(left.size, 8), 8))))
-        again = run(wider, filled)
-        out = jax.tree.map(lambda x, y, left=left: x.at[left].set(y[: left.size]), out, again)
-    return out
-
-
-_SPARE = 3  # cells: the margin in which sand must not move, and how far the tool moves in its window
-
-
-def _windows(scene: Scene, push: Push, least: float) -> Iterator[Scene]:
-    """The scene with windows around its blade, each twice as wide as the one before, as long as the map is `least` times as
-    wide; sand that reaches a window's edge asks for the next."""
-    if not (isinstance(scene.window, Whole) and isinstance(scene.tool, Blade) and isinstance(push, SteppedPush)):
-        return
-    parts = [concrete(x) for x in (scene.tool.width, scene.tool.thickness, scene.tool.depth, scene.grid.spacing)]
-    angle = concrete(scene.material.repose_angle)
-    if angle is None or any(x is None or x.ndim for x in parts):
-        return
-    width, thickness, depth, dx = (float(x) for x in parts if x is not None)
-    heap = math.sqrt(width * max(depth, dx / 2) / math.tan(float(np.min(angle))))
-    cells = (math.hypot(width, thickness) + 4 * heap) / dx + 2 * _SPARE
-    if not cells * least <= max(scene.grid.shape):
-        return
-    size = 2 * math.ceil(cells / 2)
-    while size * least <= max(scene.grid.shape):
-        rows, columns = scene.grid.shape
-        yield replace(
-            scene,
-            window=Window((min(size, rows), min(size, columns)), jnp.asarray(1e-3, jnp.result_type(scene.grid.spacing))),
-        )
-        size *= 2
+    scenes = [*windows_for(scene, rules[0], 1.5), scene]
+    return in_turns([partial(run, one) for one in scenes], lambda out: out.outcome & Outcome.WINDOW_EDGE)
 
 
 class OutcomeError(RuntimeError):

@@ -1,0 +1,61 @@
+"""A blade turns in place, by sub-steps of an angle: what it sweeps leaves along its faces."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsand import blade
+from jaxsand.advance import Rest, Step
+from jaxsand.bed import at
+from jaxsand.block import Moving, Way, contact, coordinates
+from jaxsand.frame import Frame, corner
+from jaxsand.resting import bring_to_rest
+from jaxsand.stencil import inner
+from jaxsand.tool import Pose
+
+
+@dataclass(frozen=True)
+class Turn(Step):
+    """A part of a turn in place: the blade turns by as much as moves its corners by `substep` spacings."""
+
+    substep: float = 0.125
+    sweeps: int = 4
+    rest: Rest = bring_to_rest
+
+    def turned(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
+        return jnp.all(k * self._part(way) >= jnp.abs(way.angle))
+
+    def _part(self, way: Way) -> jax.Array:
+        far = jnp.minimum(jnp.hypot(way.half, way.side), math.hypot(*self.block.shape))
+        return self.substep / far
+
+    def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
+        whole = self._part(way)
+        begin = k * whole
+        ahead = jnp.clip(jnp.abs(way.angle) - begin, 0, whole)
+        part = ahead / whole
+        sign = jnp.where(way.angle < 0, -1.0, 1.0).astype(begin.dtype)
+        no = jnp.zeros((), bool)
+        frame = Frame(_rotated(way.start, sign * begin), no, no, no, self.block.shape)
+        after = replace(frame, pose=_rotated(way.start, sign * (begin + ahead)))
+        pose, first = frame.pose, corner(frame, self.block.size, frame.pose.x, frame.pose.y)
+        view, old = self.block.view(way, frame, first, sand.height)
+        now, then = coordinates(self.block.size, frame, first), coordinates(self.block.size, after, first)
+        reach = blade.turned(now, then, way.half, way.side, sign * ahead)
+        near = contact(way, view, inner(reach.swept), old)
+        taken = jnp.where(ahead > 0, blade.cleared(reach, old, way.bottom / way.quantum), 0)
+        face = blade.facing(at(now[1]), sign * ahead) / jnp.maximum(jnp.abs(pose.cos), jnp.abs(pose.sin))
+        h, lost = self.block.displaced(way, view, blade.any_way(face * pose.cos, face * pose.sin), old, taken)
+        guess = tuple(f * part for f in sand.flux)
+        new, flux = self.rest(self.block.sand(way, view, reach), way.rate * near * part, self.sweeps, h, guess)
+        gone = None if lost is None else lost + flux[-1]
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))
+        return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
+
+
+def _rotated(pose: Pose, angle: jax.Array) -> Pose:
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return Pose(pose.x, pose.y, pose.cos * cos - pose.sin * sin, pose.sin * cos + pose.cos * sin)
