@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.bed import at, truncate
-from jaxsand.flux import Fluxes
+from jaxsand.flux import NARROW, Fluxes
 from jaxsand.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, neighbour
 
@@ -77,12 +77,13 @@ def facing(across: jax.Array, angle: jax.Array) -> jax.Array:
 
 
 def cleared(reach: Reach, h: jax.Array, bottom: jax.Array) -> jax.Array:
-    """The sand that has to leave the cells of a block, in whole quanta: all that is above the bottom where the blade fills
-    the cell."""
-    before, swept = inner(reach.before), inner(reach.swept)
+    """The sand that has to leave the cells of a block, in whole quanta; ahead of the middle plane also what is still inside
+    of the blade, in cells that it all but fills."""
+    before, swept, along = inner(reach.before), inner(reach.swept), inner(reach.along)
     grown = swept > before
     part = jnp.where(grown, (swept - before) / jnp.where(grown, 1 - before, 1), 0)
-    return truncate(jnp.where(swept >= 1, 1, part) * jnp.maximum(h - bottom, 0))
+    inside = jnp.where(along > 0, jnp.clip(1 - (1 - swept) / NARROW, 0, 1), 0)
+    return truncate(jnp.maximum(part, inside) * jnp.maximum(h - bottom, 0))
 
 
 def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.Array, Fluxes]:

@@ -36,6 +36,7 @@ from jaxsand.grid import Neighbours, links
 from jaxsand.stencil import both_ends, inner, neighbour, net, outer, spread, steps, total
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open
+_GUESSED = 0.02  # and so does a guess
 
 
 @jax.tree_util.register_dataclass
@@ -91,7 +92,7 @@ def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess:
         here, flux = lax.optimization_barrier((model, flux))
         return lax.optimization_barrier(here.shrink(flux, here.sand.surface(h + here.gained(flux))))
 
-    flux = lax.fori_loop(0, sweeps, stage, model.begin(guess))
+    flux = lax.fori_loop(0, sweeps, stage, lax.optimization_barrier(_where_open(sand, guess)))
     return lax.optimization_barrier(h + model.gained(flux)), flux
 
 
@@ -107,7 +108,7 @@ def bring_to_rest_and_back(
     """
     if sand.neighbours == "isotropic" or sand.sides is not None or sand.drop.ndim == h.ndim:
         return bring_to_rest(sand, rate, sweeps, h, guess)
-    return _rest(sweeps, sand, rate, h, guess)
+    return _rest(sweeps, sand, rate, h, _where_open(sand, guess))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -124,9 +125,8 @@ def _rest_forth(sweeps: int, sand: Sand, rate: jax.Array, h: jax.Array, guess: F
         tape = jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, k, 0), tape, flux)
         return lax.optimization_barrier(here.shrink(flux, here.sand.surface(h + here.gained(flux)))), tape
 
-    start = model.begin(guess)
-    tape = jax.tree.map(lambda x: jnp.zeros((sweeps, *x.shape), x.dtype), start)
-    flux, tape = lax.fori_loop(0, sweeps, stage, (start, tape))
+    tape = jax.tree.map(lambda x: jnp.zeros((sweeps, *x.shape), x.dtype), guess)
+    flux, tape = lax.fori_loop(0, sweeps, stage, (guess, tape))
     return (h + model.gained(flux), flux), (model, h, tape)
 
 
@@ -181,8 +181,7 @@ def _rest_back(sweeps: int, kept: Any, cotangent: Any) -> tuple[Any, ...]:
         neighbours,
     )
     of_rate = sum(total(w * g) / length for w, g, length in zip(weights, sand.gates, lengths, strict=True))
-    guess = tuple(jnp.where(w > 0, p, 0) for w, p in zip(model.weights, psi, strict=True))
-    return of_sand, of_rate, gain, guess
+    return of_sand, of_rate, gain, psi
 
 
 _rest.defvjp(_rest_forth, _rest_back)
@@ -202,12 +201,6 @@ class _Links:
         lengths = [length for _, _, length in links(sand.neighbours)]
         weights = tuple(g * (rate / length) for g, length in zip(sand.gates, lengths, strict=True))
         return cls(sand, rate, lax.optimization_barrier(weights))
-
-    def begin(self, guess: Fluxes) -> Fluxes:
-        """The guess, where links are open."""
-        gates = self.weights if self.sand.sides is None else (*self.weights, self.sand.sides)
-        whole = tuple(truncate(jnp.where(g > 0, f, 0)) for g, f in zip(gates, guess, strict=True))
-        return lax.optimization_barrier(whole)
 
     def shrink(self, flux: Fluxes, s: jax.Array) -> Fluxes:
         out, drop = [], self.sand.drop
@@ -236,11 +229,8 @@ class _Gradients:
     sand: Sand
     rate: jax.Array
 
-    def begin(self, guess: Fluxes) -> Fluxes:
-        return lax.optimization_barrier(guess)
-
     def shrink(self, y: Fluxes, s: jax.Array) -> Fluxes:
-        arms = [d * jnp.minimum(gate / _FELT, 1) for d, gate in zip(steps("isotropic", s), self.sand.gates, strict=True)]
+        arms = [d * _felt(gate) for d, gate in zip(steps("isotropic", s), self.sand.gates, strict=True)]
         across, up = _both_ends(arms)
         out = []
         for n in range(4):
@@ -269,6 +259,18 @@ def _both_ends(arms: list[jax.Array]) -> tuple[tuple[jax.Array, jax.Array], tupl
     """The steps over each cell's links to the west and east, and to the south and north."""
     x, y = arms
     return (x[:, :-1], x[:, 1:]), (y[:-1], y[1:])
+
+
+def _felt(gate: jax.Array) -> jax.Array:
+    return jnp.minimum(gate / _FELT, 1)
+
+
+def _where_open(sand: Sand, guess: Fluxes) -> Fluxes:
+    """The guess, as far as links are open."""
+    if sand.neighbours == "isotropic":
+        return guess
+    gates = sand.gates if sand.sides is None else (*sand.gates, sand.open)
+    return tuple(truncate(jnp.minimum(g / _GUESSED, 1) * f) for g, f in zip(gates, guess, strict=True))
 
 
 def _over(sand: Sand, rate: jax.Array, y: jax.Array, s: jax.Array) -> jax.Array:

@@ -32,17 +32,17 @@ from jaxsand.scene import Scene
 from jaxsand.tool import Pose, coverage, local
 from jaxsand.window import Whole
 
-# Shapes, fitted to SteppedPush(0.25, 64) with blades of 2 to 6 cells; lengths are shares of the reach r.
-_LAG = 1.35  # the heap carries on longer than l: it is not steady yet
-_THROW = 1.45  # how far the heap reaches ahead
-_FLARE = 0.5  # and beyond the blade's ends
-_GAP = 0.16  # where the berms' crests lie outside of the blade's ends
-_NEAR = 0.52  # how far the berms reach from there
-_INTO = 0.67  # of the berms, times r / w: what has slid back into the trench behind the blade
-_DOWN = 0.6  # how far from the blade's ends that lies
+# Shapes, fitted to SteppedPush.fine() with blades of 2 to 6 cells; lengths are shares of the reach r.
+_LAG = 1.56  # the heap carries on longer than l: it is not steady yet
+_THROW = 1.48  # how far the heap reaches ahead
+_FLARE = 0.51  # and beyond the blade's ends
+_GAP = 0.12  # where the berms' crests lie outside of the blade's ends
+_NEAR = 0.55  # how far the berms reach from there
+_INTO = 0.6  # of the berms, times r / w: what has slid back into the trench behind the blade
+_DOWN = 0.645  # how far from the blade's ends that lies
 _INNER = 1.3  # how far it is strewn
-_BEHIND = 0.2  # of the sand under the blade when it is lowered: what leaves behind it
-_ASIDE = 0.38  # and to its sides
+_BEHIND = 0.256  # of the sand under the blade when it is lowered: what leaves behind it
+_ASIDE = 0.307  # and to its sides
 ROOM = 0.25  # with less room than this part of a profile's own, sand is held back
 
 

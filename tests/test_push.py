@@ -58,9 +58,7 @@ def test_a_trench_has_a_level_floor_berms_at_repose_and_a_heap_ahead(dtype, degr
         assert berm.max() > 0.3 * BLADE.depth
     assert h[(s < -0.03) | (np.abs(n) > 0.07)].max() < 1e-9
     assert np.maximum(h, 0).sum() == pytest.approx(np.maximum(-h, 0).sum(), rel=1e-5)
-    assert float(js.steepest_slope(scene(), out.height)) <= MU + 1.1e-3
-    cross = h[32, :] if degrees == 90 else h[:, 48]
-    assert np.abs(np.diff(cross)).max() / DX > 0.9 * MU
+    assert 0.9 * MU < float(js.steepest_slope(scene(), out.height)) <= MU + 1.1e-3
 
 
 def test_no_sand_inside_the_tool(dtype):

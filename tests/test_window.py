@@ -24,7 +24,7 @@ def sand(window=None, **parts):
 
 
 @pytest.mark.parametrize(
-    "sizes", [((12, 12), (56, 56)), pytest.param(((12, 12), (28, 28), (56, 56), (72, 80)), marks=pytest.mark.slow)]
+    "sizes", [((8, 8), (56, 56)), pytest.param(((8, 8), (28, 28), (56, 56), (72, 80)), marks=pytest.mark.slow)]
 )
 def test_equal_or_flagged(sizes):
     strokes = jnp.asarray(np.random.default_rng(0).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (12, 4)))
@@ -37,8 +37,8 @@ def test_equal_or_flagged(sizes):
         flagged = [bool(o & js.Outcome.WINDOW_EDGE) for o in out.outcome]
         assert all(s or f for s, f in zip(same, flagged, strict=True))
         exact[size] = (sum(same), sum(flagged))
-    assert exact[12, 12][1] >= 11  # too small: said
-    assert exact[12, 12][0] < 6
+    assert exact[8, 8][1] >= 11  # too small: said
+    assert exact[8, 8][0] < 6
     for size in {(56, 56), (72, 80)} & exact.keys():  # large enough: the same maps
         assert exact[size] == (12, 0)
 
