@@ -179,7 +179,8 @@ class Advance(Step):
         half, further = spread(way.half, along), spread(ahead, along)
         reach = blade.straight(along - spread(begin, along), beside, half, further)
         taken = jnp.where(ahead > 0, blade.cleared(reach, h, spread(way.bottom / way.quantum, h)), 0)
-        shares = {to: spread(part, h) for to, part in blade.onward(pose.cos, pose.sin).items()}
+        room = view.holds if view.beyond is None else view.holds + view.beyond
+        shares = blade.onward(spread(pose.cos, h), spread(pose.sin, h), room)
         h, lost = self.block.displaced(way, view, shares, h, taken)
         guess = tuple(f * jnp.where(moving, part, 0) for f in moved_on(flux, ahead * pose.cos, ahead * pose.sin))
         rest = self.rest if rest is None else rest

@@ -104,9 +104,22 @@ def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.A
     return free, lax.optimization_barrier(tuple(out))
 
 
-def onward(cos: jax.Array, sin: jax.Array) -> Shares:
-    """The shares of neighbours for a direction in the first octant: across, and across and up."""
-    return {(0, 1): (cos - sin) / cos, (1, 1): sin / cos}
+def onward(cos: jax.Array, sin: jax.Array, room: jax.Array) -> Shares:
+    """The shares of neighbours for a direction in the first octant, cos and sin of [m, m]: across, and across and up.
+
+    `room` is 1 in a halo where sand can go. Where one of the two has none the other takes all; where neither has, sand slides
+    up along what is in its way, the more the more the direction leads there.
+    """
+    ahead, aslant = (cos - sin) / cos, sin / cos
+    here, there, up = at(room, 0, 1), at(room, 1, 1), at(room, 1, 0)
+    both = ahead * here + aslant * there
+    free = both > 0
+    full = jnp.where(free, both, 1)
+    return {
+        (0, 1): jnp.where(free, ahead * here / full, 0),
+        (1, 1): jnp.where(free, aslant * there / full, 0),
+        (1, 0): jnp.where(free, 0, aslant * up),
+    }
 
 
 def any_way(p: jax.Array, q: jax.Array) -> Shares:

@@ -88,9 +88,12 @@ def follow(
     """A path of legs without lifting the tool on a map [H, W] (m), then settling.
 
     `path` [n, 2] holds x, y (m). The tool is lowered once, at the first point, and takes the sand in front of it along. At a
-    corner it turns in place about its centre: what it newly covers leaves radially, the heap it had pushed stays where it
-    is. At a reversal it therefore covers nothing new, leaves its heap behind and pushes with its other face. A leg of no
-    length keeps the heading.
+    corner it turns in place about its centre, by the smaller angle, and a blade pushes what it sweeps ahead of its faces; a
+    reversal is half a turn, to the left. A leg of no length keeps the heading. What a turn leaves does not depend on how it
+    is divided into parts.
+
+    On a map much wider than the blade's heap only a window around the blade is computed, as wide as the sand asks for (not
+    inside `jit`, `grad` or `vmap`, where the scene's own window holds).
     """
     scene, height, rules = _ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)

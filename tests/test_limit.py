@@ -1,0 +1,110 @@
+"""The push against what is known of its quasi-static limit: a wall, a triangle, turns that sweep, rims with a level."""
+
+import itertools
+import math
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsand as js
+from jaxsand.pushbench import heap, push_speed
+from jaxsand.task import volume_error
+
+from .conftest import ANGLE
+
+DX = 0.01
+
+
+def square(n=40, neighbours=8, **parts):
+    return js.make_scene((n, n), DX, ANGLE, neighbours, **parts)
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "thickness", "degrees"),
+    [(8, 1.0, 22.5), (8, 1.5, 0), (8, 2.0, 45), (4, 1.0, 45), ("isotropic", 1.5, 30)],
+)
+def test_a_blade_is_a_wall(neighbours, thickness, degrees):
+    """Wider than the bed, it leaves the floor behind it clean: nothing got through."""
+    blade = js.Blade(width=0.8, thickness=thickness * DX, depth=0.012)
+    sand = square(neighbours=neighbours, tool=blade)
+    way = 0.08 * np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees))])
+    start, end = 0.2 - way, 0.2 + way
+    h = np.asarray(js.act(sand, np.zeros((40, 40)), [*start, *end]).height)
+    x, y = np.meshgrid((np.arange(40) + 0.5) * DX, (np.arange(40) + 0.5) * DX)
+    along = ((x - end[0]) * way[0] + (y - end[1]) * way[1]) / 0.08
+    behind = h[(along < -0.5 * blade.thickness - DX) & (along > -0.1)]
+    assert behind.max() < -0.995 * blade.depth
+    assert volume_error(np.zeros((40, 40)), h) < 1e-12
+
+
+@pytest.mark.parametrize("spacing", [0.01, 0.005, pytest.param(0.0025, marks=pytest.mark.slow)])
+def test_the_heap_of_a_blade_as_wide_as_its_bed_is_a_triangle(spacing):
+    found = heap(spacing, js.SteppedPush())
+    assert found["error"] < 0.02
+    assert found["volume"] == pytest.approx(1, abs=0.012)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "case",
+    [{"way": 0.05}, {"way": 0.5}, {"depth": 0.006}, {"angle": math.radians(20)}, {"angle": math.radians(40), "depth": 0.03}],
+)
+def test_heaps_of_many_kinds_are_triangles(case):
+    found = heap(0.005, js.SteppedPush(), **case)
+    assert found["toe_cells"] < 8 or found["error"] < 0.02
+
+
+def test_the_result_goes_to_a_limit_with_the_sub_step():
+    strokes = np.array([[0.08, 0.1, 0.2, 0.17], [0.22, 0.2, 0.1, 0.12]])
+    sand = js.make_scene((32, 32), DX, ANGLE, tool=js.Blade())
+    maps = [
+        np.asarray(js.step_batch(sand, np.zeros((2, 32, 32)), strokes, push=js.SteppedPush(a, 32)).height)
+        for a in (1 / 4, 1 / 8, 1 / 16)
+    ]
+    apart = [np.abs(a - b).sum() for a, b in itertools.pairwise(maps)]
+    assert apart[1] < 0.75 * apart[0]
+    assert apart[1] < 0.04 * np.abs(maps[-1]).sum()
+
+
+def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
+    sand = square(n=32, tool=js.Blade(width=0.1, thickness=0.015, depth=0.0075))
+    hair = 1e-5
+    maps = []
+    for parts in (1, 2, 4):
+        headings = math.pi * np.arange(parts + 1) / parts
+        path = 0.16 + hair * np.concatenate([np.zeros((1, 2)), np.cumsum(np.c_[np.cos(headings), np.sin(headings)], 0)])
+        maps.append(np.asarray(js.follow(sand, np.zeros((32, 32)), path).height))
+    for h in maps[1:]:
+        assert np.abs(h - maps[0]).sum() < 0.03 * np.abs(maps[0]).sum()
+    x, y = np.meshgrid(np.arange(32) + 0.5 - 16, np.arange(32) + 0.5 - 16)
+    disc = maps[0][np.hypot(x, y) < 2]
+    assert disc.mean() < -0.8 * 0.0075  # it dug where it swept
+
+
+def test_nothing_drains_over_a_rim_above_the_sand():
+    stroke, level = [0.16, 0.16, 0.16, 0.5], np.zeros((32, 32))
+    drained = {}
+    for rim in (10.0, 0.0, -0.02):
+        sand = square(n=32, tool=js.Blade(), edge=js.Draining(rim))
+        out = js.step(sand, level if rim >= 0 else js.settle(sand, level).height, stroke)
+        drained[rim] = float(out.drained)
+    assert drained[10.0] == 0
+    assert 0 < drained[0.0] < drained[-0.02]
+
+
+def test_large_maps_are_computed_where_sand_moves():
+    sand = square(n=160, tool=js.Blade())
+    level = np.zeros((160, 160), np.float32)
+    path = np.array([[0.6, 0.7], [0.75, 0.7], [0.72, 0.83]])
+    near = js.follow(sand, level, path)
+    whole = jax.jit(lambda h: js.follow(sand, h, path))(level)
+    js.check(near)
+    assert np.abs(near.height - whole.height).max() < 2e-5
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_pushes_reports_rates():
+    rows = push_speed(16)
+    assert {row["name"] for row in rows} >= {"vmap(step)", "step_batch, swath"}
+    assert all(row["pushes_per_second"] > 0 for row in rows)
