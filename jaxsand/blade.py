@@ -107,8 +107,8 @@ def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.A
 def onward(cos: jax.Array, sin: jax.Array, room: jax.Array) -> Shares:
     """The shares of neighbours for a direction in the first octant, cos and sin of [m, m]: across, and across and up.
 
-    `room` is 1 in a halo where sand can go. Where one of the two has none the other takes all; where neither has, sand slides
-    up along what is in its way, the more the more the direction leads there.
+    `room` is 1 in a halo where sand can go. Where one of the two has none the other takes all; where neither has, sand
+    slides up along what is in its way, the more the more the direction leads there.
     """
     ahead, aslant = (cos - sin) / cos, sin / cos
     here, there, up = at(room, 0, 1), at(room, 1, 1), at(room, 1, 0)
