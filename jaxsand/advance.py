@@ -1,4 +1,4 @@
-"""The steps of a blade's leg: it is lowered, it turns in place, it moves ahead. Each is a step of a loop (loop.py).
+"""The steps of a blade's leg: it is lowered, and it moves ahead. Each is a step of a loop (loop.py).
 
 The sub-steps ahead are pulled back in their block alone: from the block before a step its sub-steps are made again, and
 each is differentiated by JAX but for the sand's coming to rest, whose derivative resting.py writes out.

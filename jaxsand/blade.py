@@ -18,11 +18,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.bed import at, truncate
+from jaxsand.displace import EIGHT, shares
 from jaxsand.flux import NARROW, Fluxes
 from jaxsand.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, neighbour
 
-EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 _LEAST = 1e-4
 Shares = dict[tuple[int, int], jax.Array]
 
@@ -123,16 +123,12 @@ def onward(cos: jax.Array, sin: jax.Array, room: jax.Array) -> Shares:
 
 
 def any_way(p: jax.Array, q: jax.Array) -> Shares:
-    """The shares of the eight neighbours for directions (p across, q up) of largest component 1 or less: bilinear, the part
-    that would stay in place to the four straight neighbours alike."""
-    columns = {-1: jnp.maximum(-p, 0), 0: 1 - jnp.abs(p), 1: jnp.maximum(p, 0)}
-    rows = {-1: jnp.maximum(-q, 0), 0: 1 - jnp.abs(q), 1: jnp.maximum(q, 0)}
-    stay = rows[0] * columns[0] / 4
-    return {(di, dj): rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in EIGHT}
+    """The shares of the eight neighbours for directions (p across, q up) of largest component 1 or less; see `shares`."""
+    return dict(zip(EIGHT, shares(p, q), strict=True))
 
 
 def handed_on(
-    shares: Shares, holds: jax.Array, carried: jax.Array, over: tuple[jax.Array, jax.Array] | None
+    parts: Shares, holds: jax.Array, carried: jax.Array, over: tuple[jax.Array, jax.Array] | None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """What stays of `carried` quanta, what cells receive, and what is lost over a rim.
 
@@ -140,7 +136,7 @@ def handed_on(
     much of what is carried may pass over that; the rest stays.
     """
     kept, got, lost = carried, jnp.zeros_like(carried), None if over is None else jnp.zeros_like(carried)
-    for (di, dj), part in shares.items():
+    for (di, dj), part in parts.items():
         given = truncate(part * carried)
         kept = kept - given * at(holds, di, dj)
         got = got + neighbour(given, -di, -dj)

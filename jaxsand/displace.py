@@ -18,7 +18,7 @@ from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
 from jaxsand.flux import stand
 from jaxsand.loop import Plain, repeat, repeat_until, split
 from jaxsand.sweep import Flow
-from jaxsand.tool import Pose, local
+from jaxsand.tool import Pose
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]
@@ -91,15 +91,6 @@ def shares(p: jax.Array, q: jax.Array) -> Shares:
     rows = {-1: jnp.maximum(-q, 0), 0: 1 - jnp.abs(q), 1: jnp.maximum(q, 0)}
     stay = rows[0] * columns[0] / 4
     return [rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in EIGHT]
-
-
-def radial(job: Job, pose: Pose) -> Shares:
-    """The shares for directions away from the blade's centre, in its proportions."""
-    along, across = local(pose, job.x, job.y)
-    least = 1e-3 * job.bed.spacing  # a blade of no width or thickness pushes nothing, but must not divide by nothing
-    thickness, width = (jnp.maximum(x, least) for x in (job.tool.thickness, job.tool.width))
-    s, n = along / thickness**2, across / width**2
-    return outwards(job, pose, s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos)
 
 
 def outwards(job: Job, pose: Pose, p: jax.Array, q: jax.Array) -> Shares:

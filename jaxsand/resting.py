@@ -113,7 +113,7 @@ def bring_to_rest_and_back(
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _rest(sweeps: int, sand: Sand, rate: jax.Array, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
-    return bring_to_rest(sand, rate, sweeps, h, guess)
+    return _rest_forth(sweeps, sand, rate, h, guess)[0]
 
 
 def _rest_forth(sweeps: int, sand: Sand, rate: jax.Array, h: jax.Array, guess: Fluxes) -> tuple[Any, Any]:
