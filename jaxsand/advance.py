@@ -1,4 +1,4 @@
-"""The steps of a blade's leg: it is lowered, and it moves ahead. Each is a step of a loop (loop.py).
+"""A blade moves ahead, by sub-steps; a step of a loop (loop.py) is several of them, within a spacing.
 
 The sub-steps ahead are pulled back in their block alone: from the block before a step its sub-steps are made again, and
 each is differentiated by JAX but for the sand's coming to rest, whose derivative resting.py writes out.
@@ -14,15 +14,35 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import blade
-from jaxsand.bed import at, truncate
-from jaxsand.block import Block, Moving, View, Way, contact, coordinates, pose_ahead
+from jaxsand.bed import at, halo
+from jaxsand.block import Block, First, Moving, Stand, View, Way, pose_ahead
 from jaxsand.flux import Fluxes
-from jaxsand.frame import Frame, corner, cut, frame_of, paste, places, shifted, shifted_back
-from jaxsand.loop import Plain, repeat_until, split
-from jaxsand.resting import Sand, bring_to_rest, bring_to_rest_and_back, moved_on
+from jaxsand.frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
+from jaxsand.loop import Plain, split
+from jaxsand.rested import Rested, blank, rest_pulled, rest_taped
+from jaxsand.resting import Links, Sand, bring_to_rest, moved_on, where_open
 from jaxsand.stencil import inner, spread
 
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
+
+
+State = tuple[jax.Array, Fluxes, Stand]  # heights, fluxes, and how sand stood last in the block
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ready:
+    """Sand that is yet to come to rest: how it stands near the blade and in the block, at which rate it flows, its heights,
+    and a guess of what flows."""
+
+    near: Stand
+    sand: Sand
+    rate: jax.Array
+    height: jax.Array
+    guess: Fluxes
+
+    def stand(self) -> Stand:
+        return Stand(self.sand.gates, self.sand.open, self.sand.stretch)
 
 
 @dataclass(frozen=True)
@@ -30,7 +50,7 @@ class Step:
     """A step of a loop that computes a batch in the last axis; see loop.py."""
 
     block: Block
-    tape: int = 64
+    tape: int = 32
     trailing = True
 
     @property
@@ -48,53 +68,6 @@ class Step:
 
     def pull(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
         return Plain(self).pull(way, k, record, cotangent)
-
-
-@dataclass(frozen=True)
-class Lower(Step):
-    """The blade comes down: what it covers leaves radially, until all of it rests."""
-
-    tape: int = 1
-
-    def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
-        frame = frame_of(self.block.shape, way.start)
-        pose, first = frame.pose, corner(frame, self.block.size, frame.pose.x, frame.pose.y)
-        view, old = self.block.view(way, frame, first, sand.height)
-        along, across = coordinates(self.block.size, frame, first)
-        beside = blade.share(across, -way.side, way.side)
-        cover = inner(blade.straight(along, beside, way.half, jnp.zeros_like(way.length)).after)
-        along, across = inner(along), inner(across)
-        taken = truncate(cover * jnp.maximum(old - way.bottom / way.quantum, 0)) * at(view.holds)
-        s, n = along / (4 * way.half**2), across / (4 * way.side**2)
-        p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
-        size = jnp.maximum(jnp.abs(p), jnp.abs(q))
-        x, y = along * pose.cos - across * pose.sin, along * pose.sin + across * pose.cos
-        scale = jnp.minimum(jnp.maximum(jnp.abs(x), jnp.abs(y)), 1) / jnp.where(size > 0, size, 1)
-        scale = jnp.where(size > 0, scale, 0)
-        shares = blade.any_way(p * scale, q * scale)
-        over = self.block.over(way, view, old)
-        gone = None if over is None else jnp.zeros_like(old)
-        params = (shares, view.holds, cover, over)
-        state = (old - taken, gone, taken)
-        (new, gone, carried), _ = repeat_until(_at_rest, Plain(_spread, 16), 2 * self.block.size, params, state)
-        new = new + carried
-        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
-        lost = self.block.lose(way, view, sand.lost, gone)
-        return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge)
-
-
-def _spread(params: Any, k: jax.Array, state: Any) -> Any:
-    """Sand handed on by one cell: it comes to rest in the open share of cells, and moves on in the rest."""
-    shares, holds, cover, over = params
-    h, gone, carried = state
-    free = None if over is None else (over[0], over[1] * carried)
-    kept, got, lost = blade.handed_on(shares, holds, carried, free)
-    rest = truncate((1 - cover) * got)
-    return h + rest + kept, None if gone is None else gone + lost, got - rest
-
-
-def _at_rest(params: Any, k: jax.Array, state: Any) -> jax.Array:
-    return ~jnp.any(state[2] > 0)
 
 
 @dataclass(frozen=True)
@@ -123,52 +96,50 @@ class Advance(Step):
         flux = shifted(sand.flux, by) if self.block.follows else sand.flux
         cover, rate = self.felt(way, k, first, view, old)
         gone = jnp.zeros_like(old) if self.block.drains else None
-        new, after, gone = lax.fori_loop(0, self.chunk, partial(self.substeps, way, rate, k, first, view), (old, flux, gone))
+
+        def substep(i: jax.Array, carry: tuple[State, jax.Array | None]) -> tuple[State, jax.Array | None]:
+            state, gone = carry
+            ready, lost = self.ready(way, rate, k, first, view, i, state)
+            h, flux = self.rest(ready.sand, ready.rate, self.sweeps, ready.height, ready.guess)
+            if gone is not None and lost is not None:
+                gone = gone + lost + flux[-1]
+            return (h, flux, ready.stand()), gone
+
+        state = (old, flux, self.block.clear(view))
+        (new, after, _), gone = lax.fori_loop(0, self.chunk, substep, (state, gone))
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
         lost = self.block.lose(way, view, sand.lost, gone)
         out = Moving(self.block.back(way, view, sand.height, new), lost, after, edge)
         if self.block.drains or way.drop.ndim == sand.height.ndim:
             return out, sand
-        return out, (view.holds, old, flux)
+        return out, (jnp.where(at(view.holds) > 0, old, jnp.nan), flux)
 
-    def block_of(
-        self, way: Way, frame: Frame, k: jax.Array
-    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    def block_of(self, way: Way, frame: Frame, k: jax.Array) -> tuple[First, First]:
         """Where the block of step k begins, and by how much that has moved."""
         begins = []
         for j in (jnp.maximum(k - 1, 0), k):
             middle = (jnp.maximum(j - self.lowered, 0) + 0.5) * (self.chunk * self.substep)
             pose = pose_ahead(frame, jnp.minimum(middle, way.length))
-            begins.append(corner(frame, self.block.size, pose.x, pose.y))
+            begins.append(self.block.corner(pose.x, pose.y))
         old, new = begins
         return new, (new[0] - old[0], new[1] - old[1])
 
-    def felt(
-        self, way: Way, k: jax.Array, first: tuple[jax.Array, jax.Array], view: View, h: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def felt(self, way: Way, k: jax.Array, first: First, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The share of each cell that the blade covers at any time in step k, and the rate at which sand flows then."""
-        along, across = coordinates(self.block.size, frame_of(self.block.shape, way.start), first)
+        along, across = self.block.coordinates(frame_of(self.block.shape, way.start), first)
         begin = jnp.minimum(jnp.maximum(k - self.lowered, 0) * (self.chunk * self.substep), way.length)
         ahead = jnp.where(k >= self.lowered, jnp.minimum(way.length - begin, self.chunk * self.substep), 0)
         beside = blade.share(across, -way.side, way.side)
         cover = inner(blade.straight(along - begin, beside, way.half, ahead).swept)
-        return cover, way.rate * contact(way, view, cover, h)
+        return cover, way.rate * self.block.contact(way, view, cover, h)
 
-    def substeps(
-        self,
-        way: Way,
-        rate: jax.Array,
-        k: jax.Array,
-        first: tuple[jax.Array, jax.Array],
-        view: View,
-        i: jax.Array,
-        state: tuple[jax.Array, Fluxes, jax.Array | None],
-        rest: Rest | None = None,
-    ) -> tuple[jax.Array, Fluxes, jax.Array | None]:
-        """Heights, fluxes and what was lost (quanta) after sub-step i of step k."""
-        h, flux, gone = state
+    def ready(
+        self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: State
+    ) -> tuple[Ready, jax.Array | None]:
+        """Sub-step i of step k up to when the sand comes to rest, and what was lost."""
+        h, flux, clear = state
         frame = frame_of(self.block.shape, way.start)
-        pose, (along, across) = frame.pose, coordinates(self.block.size, frame, first)
+        pose, (along, across) = frame.pose, self.block.coordinates(frame, first)
         side = spread(way.side, across)
         beside = lax.optimization_barrier(blade.share(across, -side, side))
         moving = k >= self.lowered
@@ -178,16 +149,15 @@ class Advance(Step):
         part = jnp.where(moving, ahead / self.substep, 1)
         half, further = spread(way.half, along), spread(ahead, along)
         reach = blade.straight(along - spread(begin, along), beside, half, further)
-        taken = jnp.where(ahead > 0, blade.cleared(reach, h, spread(way.bottom / way.quantum, h)), 0)
-        room = view.holds if view.beyond is None else view.holds + view.beyond
-        shares = blade.onward(spread(pose.cos, h), spread(pose.sin, h), room)
+        near = self.block.part(h)
+        taken = jnp.where(ahead > 0, blade.cleared(reach, near, spread(way.bottom / way.quantum, near)), 0)
+        room = self.block.part(view.holds if view.beyond is None else view.holds + view.beyond)
+        shares = blade.onward(spread(pose.cos, near), spread(pose.sin, near), room)
         h, lost = self.block.displaced(way, view, shares, h, taken)
         guess = tuple(f * jnp.where(moving, part, 0) for f in moved_on(flux, ahead * pose.cos, ahead * pose.sin))
-        rest = self.rest if rest is None else rest
-        h, flux = rest(self.block.sand(way, view, reach), rate * part, self.sweeps, h, guess)
-        if gone is not None and lost is not None:
-            gone = gone + lost + flux[-1]
-        return h, flux, gone
+        around = self.block.around(view, reach)
+        sand = self.block.sand(way, view, clear, around)
+        return Ready(around, sand, rate * part, h, where_open(sand, guess)), lost
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
         if isinstance(record, Moving):
@@ -196,9 +166,9 @@ class Advance(Step):
         block = cut(inside.where, dsand.height, 0.0) / way.quantum
         flux = shifted(dsand.flux, inside.by) if self.block.follows else dsand.flux
 
-        def whole(floats: Any, *state: Any) -> Any:
-            rate = inside.rate(floats, state[0])
-            return lax.fori_loop(0, self.chunk, lambda i, state: inside.substep(floats, rate, i, *state), state)
+        def whole(floats: Any, h: jax.Array, flux: Fluxes) -> Any:
+            rate = inside.rate(floats, h)
+            return lax.fori_loop(0, self.chunk, lambda i, state: inside.substep(floats, rate, i, *state), (h, flux))
 
         _, (block, flux) = jax.jvp(whole, (inside.floats, *inside.state), (dway, block, flux))
         height = paste(inside.where, dsand.height, block * at(inside.holds) * way.quantum)
@@ -208,48 +178,22 @@ class Advance(Step):
         if isinstance(record, Moving):
             return super().pull(way, k, record, cotangent)
         inside = _Inside(self, way, k, record)
-        floats = inside.floats
-        rate, to_rate = jax.vjp(inside.rate, floats, inside.state[0])
-
-        def again(i: jax.Array, carry: Any) -> Any:
-            state, tape = carry
-            tape = jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, i, 0), tape, state)
-            return inside.substep(floats, rate, i, *state), tape
-
-        tape = jax.tree.map(lambda x: jnp.zeros((self.chunk, *x.shape), x.dtype), inside.state)
-        _, tape = lax.fori_loop(0, self.chunk, again, (inside.state, tape))
-
-        def fetched(i: jax.Array) -> Any:
-            return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, i, 0, keepdims=False), tape)
-
-        def back(j: jax.Array, carry: Any) -> Any:
-            (h, f), of_floats, of_rate, of_state = carry
-            i = self.chunk - 1 - j
-
-            def step(floats: Any, rate: jax.Array, h: jax.Array, f: Fluxes) -> tuple[jax.Array, Fluxes]:
-                return inside.substep(floats, rate, i, h, f, bring_to_rest_and_back)
-
-            pulled = jax.vjp(step, floats, rate, h, f)[1]
-            df, dr, *of_state = pulled(of_state)
-            return fetched(i - 1), jax.tree.map(jnp.add, of_floats, df), of_rate + dr, tuple(of_state)
-
         gain = cut(inside.where, cotangent.height, 0.0) * way.quantum
-        none = jax.tree.map(jnp.zeros_like, (floats, rate))
-        carry = (fetched(jnp.int32(self.chunk - 1)), *none, (gain, cotangent.flux))
-        _, of_floats, of_rate, (dh, dflux) = lax.fori_loop(0, self.chunk, back, carry)
-        df, more = to_rate(of_rate)
-        height = paste(inside.where, cotangent.height, (dh + more) * at(inside.holds) / way.quantum)
+        of_floats, dh, dflux = inside.pull((gain, cotangent.flux))
+        height = paste(inside.where, cotangent.height, dh * at(inside.holds) / way.quantum)
         dflux = shifted_back(dflux, inside.by) if self.block.follows else dflux
-        return jax.tree.map(jnp.add, of_floats, df), Moving(height, None, dflux, cotangent.edge)
+        return of_floats, Moving(height, None, dflux, cotangent.edge)
 
 
 class _Inside:
     """Step k of `Advance` in its block alone, as a function of all that it depends on; nothing drains, and one angle."""
 
-    def __init__(self, advance: Advance, way: Way, k: jax.Array, record: tuple[jax.Array, jax.Array, Fluxes]) -> None:
+    def __init__(self, advance: Advance, way: Way, k: jax.Array, record: tuple[jax.Array, Fluxes]) -> None:
         self.advance, self.k = advance, k
-        self.holds, *state = record
-        self.state = tuple(state)
+        height, flux = record
+        solid = jnp.isnan(height)
+        self.holds = halo(jnp.where(solid, 0.0, 1.0).astype(height.dtype), 0.0)
+        self.state = (jnp.where(solid, 0, height), flux)
         frame = frame_of(advance.block.shape, way.start)
         self.first, self.by = advance.block_of(way, frame, k)
         self.where = places(frame, advance.block.size, self.first)
@@ -262,14 +206,53 @@ class _Inside:
         way = self.merge(floats)
         return self.advance.felt(way, self.k, self.first, self._view(way), h)[1]
 
-    def substep(
-        self,
-        floats: Any,
-        rate: jax.Array,
-        i: jax.Array,
-        h: jax.Array,
-        flux: Fluxes,
-        rest: Rest | None = None,
-    ) -> tuple[jax.Array, Fluxes]:
+    def ready(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Ready:
         way = self.merge(floats)
-        return self.advance.substeps(way, rate, self.k, self.first, self._view(way), i, (h, flux, None), rest)[:2]
+        view = self._view(way)
+        state = (h, flux, self.advance.block.clear(view))
+        return self.advance.ready(way, rate, self.k, self.first, view, i, state)[0]
+
+    def substep(self, floats: Any, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
+        ready = self.ready(i, floats, rate, h, flux)
+        return bring_to_rest(ready.sand, ready.rate, self.advance.sweeps, ready.height, ready.guess)
+
+    def pull(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Any, jax.Array, Fluxes]:
+        """The cotangents of the floats, the heights and the fluxes: from the last sub-step backwards, made again."""
+        chunk, sweeps, floats = self.advance.chunk, self.advance.sweeps, self.floats
+        rate, to_rate = jax.vjp(self.rate, floats, self.state[0])
+
+        def again(i: jax.Array, carry: Any) -> Any:
+            state, tape = carry
+            tape = jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, i, 0), tape, state)
+            return self.substep(floats, rate, i, *state), tape
+
+        tape = jax.tree.map(lambda x: jnp.zeros((chunk, *x.shape), x.dtype), self.state)
+        _, tape = lax.fori_loop(0, chunk, again, (self.state, tape))
+
+        def fetched(i: jax.Array) -> Any:
+            return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, i, 0, keepdims=False), tape)
+
+        def back(j: jax.Array, carry: Any) -> Any:
+            state, of_floats, of_rate, of_state, steps = carry
+            i = chunk - 1 - j
+            if self.advance.block.neighbours == "isotropic":
+                pulled = jax.vjp(lambda *x: self.substep(x[0], x[1], i, *x[2:]), floats, rate, *state)[1]
+                df, dr, *of_state = pulled(of_state)
+            else:
+                depends, pulled, sand = jax.vjp(partial(self._depends, i), floats, rate, *state, has_aux=True)
+                model = Links(sand, depends.rate)
+                steps = rest_taped(model, sweeps, depends.height, depends.guess, steps)
+                df, dr, *of_state = pulled(rest_pulled(model, sweeps, self.advance.block.part, steps, of_state))
+            return fetched(i - 1), jax.tree.map(jnp.add, of_floats, df), of_rate + dr, tuple(of_state), steps
+
+        none = jax.tree.map(jnp.zeros_like, (floats, rate))
+        carry = (fetched(jnp.int32(chunk - 1)), *none, cotangent, blank(sweeps, *self.state))
+        _, of_floats, of_rate, (dh, dflux), _ = lax.fori_loop(0, chunk, back, carry)
+        df, more = to_rate(of_rate)
+        return jax.tree.map(jnp.add, of_floats, df), dh + more, dflux
+
+    def _depends(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[Rested, Sand]:
+        """What the sand's coming to rest depends on, and the sand."""
+        ready = self.ready(i, floats, rate, h, flux)
+        near, sand = ready.near, ready.sand
+        return Rested(near.gates, near.stretch, sand.bottom, sand.drop, ready.rate, ready.height, ready.guess), sand

@@ -21,7 +21,7 @@ from jaxsand.bed import at, truncate
 from jaxsand.displace import EIGHT, shares
 from jaxsand.flux import NARROW, Fluxes
 from jaxsand.grid import Neighbours
-from jaxsand.stencil import both_ends, inner, neighbour
+from jaxsand.stencil import both_ends, inner, outer, seen
 
 _LEAST = 1e-4
 Shares = dict[tuple[int, int], jax.Array]
@@ -93,7 +93,8 @@ def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.A
     A link is as open as the narrower of its cells, times 2 / (1 + narrower / wider), and no more than the blade's middle
     plane leaves of it where that cuts it.
     """
-    free = lax.optimization_barrier((1 - reach.after) * holds)
+    # In a halo of its own the cover is stored, lest XLA compute it anew for both ends of every link.
+    free = (1 - outer(inner(reach.after))) * holds
     out = []
     of_links = (both_ends(neighbours, x) for x in (free, lax.stop_gradient(reach.along), reach.beside))
     for (here, there), (behind, before), beside in zip(*of_links, strict=True):
@@ -136,10 +137,11 @@ def handed_on(
     much of what is carried may pass over that; the rest stays.
     """
     kept, got, lost = carried, jnp.zeros_like(carried), None if over is None else jnp.zeros_like(carried)
+    source = outer(carried)
     for (di, dj), part in parts.items():
-        given = truncate(part * carried)
-        kept = kept - given * at(holds, di, dj)
-        got = got + neighbour(given, -di, -dj)
+        given = truncate(outer(part) * source)
+        kept = kept - inner(given) * at(holds, di, dj)
+        got = got + seen(given, -di, -dj)
         if over is not None and lost is not None:
             gone = truncate(part * over[1]) * at(over[0], di, dj)
             kept, lost = kept - gone, lost + gone

@@ -13,7 +13,7 @@ from jaxsand.flux import NARROW, Fluxes
 from jaxsand.frame import Frame, Places, cut, numbers, paste, places
 from jaxsand.grid import Neighbours
 from jaxsand.resting import Sand
-from jaxsand.stencil import inner, spread
+from jaxsand.stencil import both_ends, inner, put, spread, window
 from jaxsand.tool import Pose
 
 _CELLS = 16_384  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache
@@ -63,22 +63,71 @@ class View:
     beyond: jax.Array | None
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Stand:
+    """How open links and cells are, and how much higher sand stands in them for it."""
+
+    gates: Fluxes
+    open: jax.Array
+    stretch: jax.Array
+
+
+First = tuple[jax.Array, jax.Array]
+
+
 @dataclass(frozen=True)
 class Block:
-    """Which part of a map [H, W] is computed: a block of `size` squared that follows the blade, or one that holds it all."""
+    """Which part of a map [H, W] is computed: a block of `size` squared that follows the blade, or one that holds it all.
+
+    All that the blade covers or touches lies in a part of the block, `near` squared, around where the blade is.
+    """
 
     shape: tuple[int, int]
     size: int
+    near: int
     follows: bool
     neighbours: Neighbours
     drains: bool
+
+    @property
+    def before(self) -> int:
+        """How many rows and columns of the block lie before the part that is near."""
+        return (self.size - self.near) // 2
+
+    def corner(self, x: jax.Array, y: jax.Array) -> First:
+        """The first cell of the block around (x, y), across and up; the block may hang over the map."""
+        if not self.follows:
+            zero = jnp.zeros_like(x).astype(jnp.int32)
+            return zero, zero
+        behind = self.before + self.near // 2
+        begin = [jnp.floor(lax.stop_gradient(centre)).astype(jnp.int32) - behind for centre in (x, y)]
+        return begin[0], begin[1]
+
+    def coordinates(self, frame: Frame, first: First) -> tuple[jax.Array, jax.Array]:
+        """How far ahead of a pose, and to its left, the cells that are near it, and a halo, lie (spacings)."""
+        size = self.near + 2
+        like = jnp.zeros((size, size, *frame.pose.x.shape), frame.pose.x.dtype)
+        pose = jax.tree.map(lambda x: spread(x, like), frame.pose)
+        x = numbers(size, 1, first[0]) + (first[0] + self.before - 0.5) - pose.x
+        y = numbers(size, 0, first[1]) + (first[1] + self.before - 0.5) - pose.y
+        return x * pose.cos + y * pose.sin, y * pose.cos - x * pose.sin
+
+    def part(self, x: jax.Array) -> jax.Array:
+        """The part of a map that is near the blade; of one with halo, with a halo; of links, the links of its cells."""
+        rows, columns = (self.near + n - self.size for n in x.shape[:2])
+        return window(x, self.before, self.before, rows, columns)
+
+    def put(self, whole: jax.Array, part: jax.Array) -> jax.Array:
+        """A map with the part replaced that is near the blade."""
+        return put(whole, part, self.before)
 
     @property
     def together(self) -> int:
         """How many maps to push at a time."""
         return max(16, _CELLS // self.size**2 // 16 * 16) if jax.default_backend() == "cpu" else 1 << 30
 
-    def view(self, way: Way, frame: Frame, first: tuple[jax.Array, jax.Array], flat: jax.Array) -> tuple[View, jax.Array]:
+    def view(self, way: Way, frame: Frame, first: First, flat: jax.Array) -> tuple[View, jax.Array]:
         """The block that begins at `first`, and its heights (quanta)."""
         where = places(frame, self.size, first)
         h = cut(where, flat) / way.quantum
@@ -105,63 +154,64 @@ class Block:
         low, high = lose(way.quantum, block, amount * way.quantum)
         return paste(view.where, lost[0], low), paste(view.where, lost[1], high)
 
-    def touched(
-        self, way: Way, frame: Frame, first: tuple[jax.Array, jax.Array], old: jax.Array, new: jax.Array, cover: jax.Array
-    ) -> jax.Array:
+    def touched(self, way: Way, frame: Frame, first: First, old: jax.Array, new: jax.Array, cover: jax.Array) -> jax.Array:
         """How far sand moved (spacings) within two cells of the block's edge where that is not the map's; infinite where the
-        blade covers a part of it."""
+        blade covers a part of it, `cover` of what is near."""
         if not self.follows:
             return jnp.zeros_like(way.length)
         near: Any = False
         for axis, begin, cells in zip((1, 0), first, frame.extent(), strict=True):
             i = numbers(self.size, axis, begin)
             near = near | ((i < 2) & (begin > 0)) | ((i >= self.size - 2) & (begin + self.size < cells))
-        change = jnp.where(cover > 0, jnp.inf, jnp.abs(new - old) * (way.quantum / way.spacing))
+        covered = self.put(jnp.zeros_like(old), cover) > 0
+        change = jnp.where(covered, jnp.inf, jnp.abs(new - old) * (way.quantum / way.spacing))
         return lax.stop_gradient(jnp.max(jnp.where(near, change, 0), axis=(0, 1)))
 
-    def sand(self, way: Way, view: View, reach: blade.Reach) -> Sand:
+    def clear(self, view: View) -> Stand:
+        """How sand stands in the block where no blade is."""
+        gates = tuple(here * there for here, there in both_ends(self.neighbours, view.holds))
+        return Stand(gates, at(view.holds), jnp.zeros_like(at(view.holds)))
+
+    def around(self, view: View, reach: blade.Reach) -> Stand:
+        """How sand stands near a blade."""
+        free, gates = blade.gates(self.neighbours, reach, self.part(view.holds))
+        free = inner(free)
+        return Stand(gates, free, (1 - free) / jnp.maximum(free, NARROW) * at(self.part(view.holds)))
+
+    def sand(self, way: Way, view: View, clear: Stand, near: Stand) -> Sand:
+        """The sand of the block around a blade, `near` which it stands as told."""
+        stand = jax.tree.map(self.put, clear, near)
         rim = None if way.level is None else way.level / way.quantum
         bottom = way.bottom / way.quantum
-        free, gates = blade.gates(self.neighbours, reach, view.holds)
-        free = inner(free)
-        stretch = lax.optimization_barrier((1 - free) / jnp.maximum(free, NARROW))
-        return Sand(gates, free, stretch, bottom, view.drop, view.sides, rim, self.neighbours)
+        return Sand(stand.gates, stand.open, stand.stretch, bottom, view.drop, view.sides, rim, self.neighbours)
 
     def over(self, way: Way, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array] | None:
-        """What lies beyond a rim, and which part of the sand above the blade's bottom stands above the rim."""
+        """What lies beyond a rim near the blade, and which part of the sand above its bottom stands above the rim."""
         if view.beyond is None or way.level is None:
             return None
         bottom, level = way.bottom / way.quantum, way.level / way.quantum
         height = jnp.maximum(h - bottom, 0)
-        return view.beyond, jnp.clip((h - level) / jnp.where(height > 0, height, 1), 0, 1)
+        return self.part(view.beyond), jnp.clip((h - level) / jnp.where(height > 0, height, 1), 0, 1)
 
     def displaced(
         self, way: Way, view: View, shares: blade.Shares, h: jax.Array, taken: jax.Array
     ) -> tuple[jax.Array, jax.Array | None]:
-        """The heights after what was taken up was handed on by one cell, and what was lost."""
-        taken = taken * at(view.holds)
-        over = self.over(way, view, h)
-        kept, got, lost = blade.handed_on(shares, view.holds, taken, None if over is None else (over[0], over[1] * taken))
-        return lax.optimization_barrier(h - taken + kept + got), lost
+        """The heights after what was taken up near the blade was handed on by one cell, and what was lost."""
+        there, holds = self.part(h), self.part(view.holds)
+        taken = taken * at(holds)
+        over = self.over(way, view, there)
+        kept, got, lost = blade.handed_on(shares, holds, taken, None if over is None else (over[0], over[1] * taken))
+        lost = None if lost is None else self.put(jnp.zeros_like(h), lost)
+        return self.put(h, there - taken + kept + got), lost
 
+    def contact(self, way: Way, view: View, cover: jax.Array, h: jax.Array) -> jax.Array:
+        """1 while the blade is among the sand, falling to 0 where it covers no cell or hangs a spacing above all it covers.
 
-def contact(way: Way, view: View, cover: jax.Array, h: jax.Array) -> jax.Array:
-    """1 while the blade is among the sand, falling to 0 where it covers no cell or hangs a spacing above all it covers.
-
-    Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
-    """
-    spacing, bottom = way.spacing / way.quantum, way.bottom / way.quantum
-    near = jnp.clip(1 + jnp.maximum(h - bottom, -spacing) / spacing, 0, 1) * at(view.holds)
-    return jnp.minimum(1, 2 * jnp.max(jnp.max(near * cover, axis=0), axis=0))
-
-
-def coordinates(size: int, frame: Frame, first: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-    """How far ahead of a pose, and to its left, the cells of a block and its halo lie (spacings)."""
-    like = jnp.zeros((size + 2, size + 2, *frame.pose.x.shape), frame.pose.x.dtype)
-    pose = jax.tree.map(lambda x: spread(x, like), frame.pose)
-    x = numbers(size + 2, 1, first[0]) + (first[0] - 0.5) - pose.x
-    y = numbers(size + 2, 0, first[1]) + (first[1] - 0.5) - pose.y
-    return x * pose.cos + y * pose.sin, y * pose.cos - x * pose.sin
+        Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
+        """
+        spacing, bottom = way.spacing / way.quantum, way.bottom / way.quantum
+        near = jnp.clip(1 + jnp.maximum(self.part(h) - bottom, -spacing) / spacing, 0, 1) * at(self.part(view.holds))
+        return jnp.minimum(1, 2 * jnp.max(jnp.max(near * cover, axis=0), axis=0))
 
 
 def pose_ahead(frame: Frame, by: jax.Array) -> Pose:

@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from jaxsand.tool import Pose
 
@@ -47,15 +46,6 @@ def frame_of(shape: tuple[int, int], pose: Pose) -> Frame:
     swap = sin > cos
     seen = Pose(jnp.where(swap, y, x), jnp.where(swap, x, y), jnp.where(swap, sin, cos), jnp.where(swap, cos, sin))
     return Frame(seen, flip_x, flip_y, swap, shape)
-
-
-def corner(frame: Frame, size: int, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The first cell of the block of `size` squared around (x, y), moved onto the map: across and up."""
-    first = []
-    for centre, cells in zip((x, y), frame.extent(), strict=True):
-        begin = jnp.floor(lax.stop_gradient(centre)) - size // 2
-        first.append(jnp.clip(begin, 0, jnp.maximum(cells - size, 0)).astype(jnp.int32))
-    return first[0], first[1]
 
 
 def numbers(count: int, axis: int, like: jax.Array) -> jax.Array:

@@ -20,11 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.advance import Advance, Lower, Rest
+from jaxsand.advance import Advance, Rest
 from jaxsand.block import Block, Moving, Way
 from jaxsand.displace import Job
 from jaxsand.legs import Pushed, State, along_legs, over_the_map
 from jaxsand.loop import repeat, repeat_until
+from jaxsand.lowering import Lower
 from jaxsand.resting import bring_to_rest, no_flux
 from jaxsand.scene import Scene, concrete
 from jaxsand.tool import Blade, Pose
@@ -83,8 +84,11 @@ def _leg(
 ) -> State:
     """Lowers the blade, or turns it from the pose before, and moves it ahead by `length`, as far as that touches the map."""
     shape, dx, drains = scene.grid.shape, job.bed.spacing, job.bed.rim is not None
-    size = max(scene.window.size) if isinstance(scene.window, Window) else max(shape)
-    block = Block(shape, size, isinstance(scene.window, Window), scene.grid.neighbours, drains)
+    size = near = max(shape)
+    if isinstance(scene.window, Window) and max(scene.window.size) < size:
+        size = max(scene.window.size)
+        near = min(size, scene.window.near or size)
+    block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, drains)
     h, lost, moved = state
     none = no_flux(block.neighbours, drains, jnp.zeros((size, size), h.dtype))
     flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
@@ -132,6 +136,21 @@ def _leg(
 _SPARE = 3  # cells: the margin in which sand must not move, and how far the tool moves in its window
 
 
+def with_near(scene: Scene) -> Scene:
+    """The scene, whose window says how much of it is near its blade, if the blade's size is known."""
+    if not (isinstance(scene.window, Window) and isinstance(scene.tool, Blade)):
+        return scene
+    parts = [concrete(x) for x in (scene.tool.width, scene.tool.thickness, scene.grid.spacing)]
+    if any(x is None or x.ndim for x in parts):
+        return scene
+    width, thickness, dx = (float(x) for x in parts if x is not None)
+    # Covers are smoothed over a spacing; a block stays where it is while the blade moves by one; sand is handed on by one.
+    far = math.hypot(width / dx + 1, thickness / dx + 1) / 2 + 0.5
+    if not far < max(scene.grid.shape):
+        return scene
+    return replace(scene, window=replace(scene.window, near=2 * math.floor(far + 0.5) + 3))
+
+
 def windows_for(scene: Scene, push: Any, least: float) -> Iterator[Scene]:
     """The scene with windows around its blade, each twice as wide as the one before, as long as the map is `least` times as
     wide; sand that reaches a window's edge asks for the next."""
@@ -149,8 +168,6 @@ def windows_for(scene: Scene, push: Any, least: float) -> Iterator[Scene]:
     size = 2 * math.ceil(cells / 2)
     while size * least <= max(scene.grid.shape):
         rows, columns = scene.grid.shape
-        yield replace(
-            scene,
-            window=Window((min(size, rows), min(size, columns)), jnp.asarray(1e-3, jnp.result_type(scene.grid.spacing))),
-        )
+        window = Window((min(size, rows), min(size, columns)), jnp.asarray(1e-3, jnp.result_type(scene.grid.spacing)))
+        yield with_near(replace(scene, window=window))
         size *= 2

@@ -22,6 +22,7 @@ open, that is r n <= 1, and for others it holds if 2 / w >= 1 / o + 1 / o', the 
 Fluxes are whole quanta (bed.py).
 """
 
+import functools
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -29,11 +30,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import linear_call
 
-from jaxsand.bed import truncate
+from jaxsand.bed import at, halo, nearest, truncate
 from jaxsand.flux import Fluxes, ends
 from jaxsand.grid import Neighbours, links
-from jaxsand.stencil import both_ends, inner, neighbour, net, outer, spread, steps, total
+from jaxsand.stencil import both_ends, inner, net, outer, rises, total
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open
 _GUESSED = 0.02  # and so does a guess
@@ -59,7 +61,7 @@ class Sand:
     neighbours: Neighbours = field(metadata={"static": True})
 
     def surface(self, h: jax.Array) -> jax.Array:
-        return h + self.stretch * jnp.maximum(h - self.bottom, 0)
+        return h + self.stretch * jnp.where(h > self.bottom, h - self.bottom, 0)
 
 
 def no_flux(neighbours: Neighbours, drains: bool, h: jax.Array) -> Fluxes:
@@ -74,147 +76,98 @@ def no_flux(neighbours: Neighbours, drains: bool, h: jax.Array) -> Fluxes:
 
 def moved_on(flux: Fluxes, x: jax.Array, y: jax.Array) -> Fluxes:
     """Fluxes moved by a part x, y of a cell across and up, 0 to 1."""
+    return _moved(tuple(flux), x, y)
+
+
+@jax.custom_jvp
+def _moved(flux: Fluxes, x: jax.Array, y: jax.Array) -> Fluxes:
+    return _blend(1, (x, y), flux)
+
+
+@_moved.defjvp
+def _moved_jvp(primals: Any, tangents: Any) -> tuple[Fluxes, Fluxes]:
+    (flux, x, y), (dflux, dx, dy) = primals, tangents
+    carried = linear_call(partial(_blend, 1), partial(_blend, -1), (x, y), dflux)
+    farther = linear_call(_farther, _farther_back, primals, (dx, dy))
+    return _moved(flux, x, y), tuple(a + b for a, b in zip(carried, farther, strict=True))
+
+
+def _blend(way: int, parts: tuple[jax.Array, jax.Array], flux: Fluxes) -> Fluxes:
+    """Maps moved by parts of a cell; backwards, `way` -1, the transpose of that."""
+    x, y = parts
 
     def one(f: jax.Array) -> jax.Array:
-        a, b = spread(x, f), spread(y, f)
-        near = (1 - a) * f + a * neighbour(f, 0, -1)
-        return (1 - b) * near + b * ((1 - a) * neighbour(f, -1, 0) + a * neighbour(f, -1, -1))
+        u = halo(f, 0.0)
+        near = (1 - x) * f + x * at(u, 0, -way)
+        return (1 - y) * near + y * ((1 - x) * at(u, -way, 0) + x * at(u, -way, -way))
 
     return tuple(one(f) for f in flux)
 
 
+def _slopes(f: jax.Array, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """How a moved map changes with x and with y."""
+    u = halo(f, 0.0)
+    left, below, aslant = at(u, 0, -1), at(u, -1, 0), at(u, -1, -1)
+    return (left - f) * (1 - y) + (aslant - below) * y, (below - f) * (1 - x) + (aslant - left) * x
+
+
+def _farther(primals: tuple[Fluxes, jax.Array, jax.Array], by: tuple[jax.Array, jax.Array]) -> Fluxes:
+    flux, x, y = primals
+    return tuple(by[0] * across + by[1] * up for across, up in (_slopes(f, x, y) for f in flux))
+
+
+def _farther_back(primals: tuple[Fluxes, jax.Array, jax.Array], back: Fluxes) -> tuple[jax.Array, jax.Array]:
+    flux, x, y = primals
+    rows, columns = (min(n) for n in zip(*(f.shape[:2] for f in flux), strict=True))  # no sand flows beyond the others' last
+    slopes = [[(z * b)[:rows, :columns] for z in _slopes(f, x, y)] for f, b in zip(flux, back, strict=True)]
+    across, up = (functools.reduce(jnp.add, part) for part in zip(*slopes, strict=True))
+    return total(across), total(up)
+
+
 def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
     """The heights after so many proximal steps from a guess, and the fluxes that led there."""
-    model = _Gradients(sand, rate) if sand.neighbours == "isotropic" else _Links.of(sand, rate)
+    model: Links | _Gradients = _Gradients(sand, rate) if sand.neighbours == "isotropic" else Links(sand, rate)
 
     def stage(_: jax.Array, flux: Fluxes) -> Fluxes:
         # All that is the same for every step goes through the barrier too: XLA would compute more beforehand, and store it.
         here, flux = lax.optimization_barrier((model, flux))
-        return lax.optimization_barrier(here.shrink(flux, here.sand.surface(h + here.gained(flux))))
+        return lax.optimization_barrier(here.shrink(flux, outer(here.sand.surface(h + here.gained(flux)))))
 
-    flux = lax.fori_loop(0, sweeps, stage, lax.optimization_barrier(_where_open(sand, guess)))
+    flux = lax.fori_loop(0, sweeps, stage, lax.optimization_barrier(guess))
     return lax.optimization_barrier(h + model.gained(flux)), flux
-
-
-def bring_to_rest_and_back(
-    sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess: Fluxes
-) -> tuple[jax.Array, Fluxes]:
-    """`bring_to_rest` for reverse mode alone, by hand where sand flows in pairs, with one angle and over no rim.
-
-    With lambda the cotangent of the heights, psi that of the fluxes f' of a step, e = z - f' that step's own threshold with
-    its sign, and a where |z| exceeds r w m,
-
-        zeta = a psi,   of w: zeta (D s - m sign z),   of s: D' (r w zeta),   of f: zeta + G' (of s) stretched.
-    """
-    if sand.neighbours == "isotropic" or sand.sides is not None or sand.drop.ndim == h.ndim:
-        return bring_to_rest(sand, rate, sweeps, h, guess)
-    return _rest(sweeps, sand, rate, h, _where_open(sand, guess))
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _rest(sweeps: int, sand: Sand, rate: jax.Array, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
-    return _rest_forth(sweeps, sand, rate, h, guess)[0]
-
-
-def _rest_forth(sweeps: int, sand: Sand, rate: jax.Array, h: jax.Array, guess: Fluxes) -> tuple[Any, Any]:
-    model = _Links.of(sand, rate)
-
-    def stage(k: jax.Array, carry: Any) -> Any:
-        flux, tape = carry
-        here, flux = lax.optimization_barrier((model, flux))
-        tape = jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, k, 0), tape, flux)
-        return lax.optimization_barrier(here.shrink(flux, here.sand.surface(h + here.gained(flux)))), tape
-
-    tape = jax.tree.map(lambda x: jnp.zeros((sweeps, *x.shape), x.dtype), guess)
-    flux, tape = lax.fori_loop(0, sweeps, stage, (guess, tape))
-    return (h + model.gained(flux), flux), (model, h, tape)
-
-
-def _rest_back(sweeps: int, kept: Any, cotangent: Any) -> tuple[Any, ...]:
-    model, h, tape = kept
-    sand, neighbours = model.sand, model.sand.neighbours
-    lengths = [length for _, _, length in links(neighbours)]
-    gain, psi = cotangent
-    psi = tuple(p - d for p, d in zip(psi, steps(neighbours, gain), strict=True))
-
-    around = outer(sand.stretch)
-
-    def fetched(k: jax.Array) -> Fluxes:
-        return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, k, 0, keepdims=False), tape)
-
-    def stage(j: jax.Array, carry: Any) -> Any:
-        # The fluxes are part of what is carried: XLA would fetch them anew for all that uses them.
-        flux, gain, psi, felt, signs, of_stretch, lift = carry
-        here, gain, psi = lax.optimization_barrier((model, gain, psi))
-        s = outer(here.sand.surface(h + here.gained(flux)))
-        zeta, leaning = [], []
-        for f, w, (a, b), length, p in zip(flux, here.weights, both_ends(neighbours, s), lengths, psi, strict=True):
-            rise, least = b - a, here.sand.drop * length
-            z = f + w * rise
-            moved = jnp.where(jnp.abs(z) > least * w, p, 0)
-            zeta.append(moved)
-            leaning.append((moved * rise, jnp.where(z > 0, moved, -moved)))
-        of_surface = outer(-net(neighbours, tuple(w * y for w, y in zip(here.weights, zeta, strict=True))))
-        raised = jnp.where(s > here.sand.bottom, of_surface, 0)
-        change = both_ends(neighbours, of_surface + raised * around)
-        psi = tuple(y - (b - a) for y, (a, b) in zip(zeta, change, strict=True))
-        felt = tuple(old + y for old, (y, _) in zip(felt, leaning, strict=True))
-        signs = tuple(old + y for old, (_, y) in zip(signs, leaning, strict=True))
-        s, of_surface, raised = inner(s), inner(of_surface), inner(raised)
-        of_stretch = of_stretch + raised * (s - here.sand.bottom) / (1 + here.sand.stretch)
-        gain = gain + of_surface + raised * here.sand.stretch
-        return fetched(sweeps - 2 - j), gain, psi, felt, signs, of_stretch, lift + raised
-
-    nothing, none = jnp.zeros_like(h), jax.tree.map(jnp.zeros_like, model.weights)
-    carry = (fetched(jnp.int32(sweeps - 1)), gain, psi, none, none, nothing, nothing)
-    _, gain, psi, felt, signs, of_stretch, lift = lax.fori_loop(0, sweeps, stage, carry)
-    weights = tuple(y - z * (sand.drop * length) for y, z, length in zip(felt, signs, lengths, strict=True))
-    tilts = [total(z * w) * length for z, w, length in zip(signs, model.weights, lengths, strict=True)]
-    of_sand = Sand(
-        tuple(w * (model.rate / length) for w, length in zip(weights, lengths, strict=True)),
-        nothing,
-        of_stretch,
-        -total(lift * sand.stretch),
-        -sum(tilts, jnp.zeros_like(sand.drop)),
-        None,
-        None,
-        neighbours,
-    )
-    of_rate = sum(total(w * g) / length for w, g, length in zip(weights, sand.gates, lengths, strict=True))
-    return of_sand, of_rate, gain, psi
-
-
-_rest.defvjp(_rest_forth, _rest_back)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class _Links:
-    """Sand that flows in pairs: one flux to a link, in whole quanta; `weights` are r w."""
+class Links:
+    """Sand that flows in pairs: one flux to a link, in whole quanta."""
 
     sand: Sand
     rate: jax.Array
-    weights: Fluxes
 
-    @classmethod
-    def of(cls, sand: Sand, rate: jax.Array) -> "_Links":
-        lengths = [length for _, _, length in links(sand.neighbours)]
-        weights = tuple(g * (rate / length) for g, length in zip(sand.gates, lengths, strict=True))
-        return cls(sand, rate, lax.optimization_barrier(weights))
+    @property
+    def factors(self) -> list[jax.Array]:
+        """What a rise drives over an open link in each direction."""
+        return [self.rate / length for _, _, length in links(self.sand.neighbours)]
 
-    def shrink(self, flux: Fluxes, s: jax.Array) -> Fluxes:
-        out, drop = [], self.sand.drop
-        rises = steps(self.sand.neighbours, s)
-        drops = [drop] * len(rises)
-        if drop.ndim == s.ndim:
-            drops = [(here + there) / 2 for here, there in both_ends(self.sand.neighbours, outer(drop))]
-        parts = zip(links(self.sand.neighbours), self.weights, flux, rises, drops, strict=False)
-        for (_, _, length), w, f, rise, least in parts:
-            most = least * length * w
-            z = f + w * rise
-            out.append(truncate(z - jnp.clip(z, -most, most)))
+    @property
+    def most(self) -> jax.Array:
+        """What the largest stable rise would drive, the same in all directions."""
+        return self.rate * self.sand.drop
+
+    def shrink(self, flux: Fluxes, around: jax.Array) -> Fluxes:
+        """The fluxes after a step, where the surface, in a halo, is `around`."""
+        out, neighbours = [], self.sand.neighbours
+        thresholds = [self.most] * len(self.sand.gates)
+        if self.sand.drop.ndim == around.ndim:
+            thresholds = [(here + there) / 2 for here, there in both_ends(neighbours, outer(self.most))]
+        parts = zip(flux, self.sand.gates, self.factors, rises(neighbours, around), thresholds, strict=False)
+        for f, g, factor, rise, threshold in parts:
+            z, most = f + g * (factor * rise), g * threshold
+            # Comparisons become single instructions; minimum and maximum, which look for NaN, do not.
+            out.append(nearest(z - jnp.where(z > most, most, jnp.where(z < -most, -most, z))))
         if self.sand.sides is not None:
-            out.append(_over(self.sand, self.rate, flux[-1], s))
+            out.append(_over(self.sand, self.rate, flux[-1], inner(around)))
         return tuple(out)
 
     def gained(self, flux: Fluxes) -> jax.Array:
@@ -229,8 +182,9 @@ class _Gradients:
     sand: Sand
     rate: jax.Array
 
-    def shrink(self, y: Fluxes, s: jax.Array) -> Fluxes:
-        arms = [d * _felt(gate) for d, gate in zip(steps("isotropic", s), self.sand.gates, strict=True)]
+    def shrink(self, y: Fluxes, around: jax.Array) -> Fluxes:
+        """The fluxes after a step, where the surface, in a halo, is `around`."""
+        arms = [d * _felt(gate) for d, gate in zip(rises("isotropic", around), self.sand.gates, strict=True)]
         across, up = _both_ends(arms)
         out = []
         for n in range(4):
@@ -241,7 +195,7 @@ class _Gradients:
             part = jnp.where(beyond, 1 - least / jnp.sqrt(jnp.where(beyond, square, 1)), 0)
             out += [zx * part, zy * part]
         if self.sand.sides is not None:
-            out.append(_over(self.sand, self.rate, y[-1], s))
+            out.append(_over(self.sand, self.rate, y[-1], inner(around)))
         return tuple(out)
 
     def gained(self, flux: Fluxes) -> jax.Array:
@@ -265,12 +219,12 @@ def _felt(gate: jax.Array) -> jax.Array:
     return jnp.minimum(gate / _FELT, 1)
 
 
-def _where_open(sand: Sand, guess: Fluxes) -> Fluxes:
-    """The guess, as far as links are open."""
+def where_open(sand: Sand, guess: Fluxes) -> Fluxes:
+    """A guess as far as links are open, in whole quanta."""
     if sand.neighbours == "isotropic":
         return guess
     gates = sand.gates if sand.sides is None else (*sand.gates, sand.open)
-    return tuple(truncate(jnp.minimum(g / _GUESSED, 1) * f) for g, f in zip(gates, guess, strict=True))
+    return tuple(nearest(jnp.where(g < _GUESSED, g / _GUESSED, 1) * f) for g, f in zip(gates, guess, strict=True))
 
 
 def _over(sand: Sand, rate: jax.Array, y: jax.Array, s: jax.Array) -> jax.Array:

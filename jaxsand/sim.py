@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsand.batch import in_turns, on_all_cores, wide_vectors
 from jaxsand.legs import Pushed
-from jaxsand.push import SteppedPush, push_along, windows_for
+from jaxsand.push import SteppedPush, push_along, windows_for, with_near
 from jaxsand.roll import roll_along
 from jaxsand.rules import Outcome, Stop, as_batch, check_chunk, check_rate, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
@@ -229,7 +229,7 @@ def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tupl
         check_whole("push.sweeps", push.sweeps, 0)
         check_rate(scene, "push.rate", push.rate)
     scheme, stop = check_rule(scene, scheme, stop)
-    scene, height = fit(scene, height)
+    scene, height = fit(with_near(scene), height)
     return scene, height, cast((push, scheme, stop), height.dtype)
 
 

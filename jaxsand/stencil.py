@@ -17,6 +17,8 @@ from jaxsand.bed import at, halo
 from jaxsand.flux import Fluxes, ends, received
 from jaxsand.grid import Neighbours, links
 
+_SMALL = 24  # rows
+
 
 def _linear(forth: Callable, back: Callable, x: Any) -> Any:
     return linear_call(lambda _, x: forth(x), lambda _, y: back(y), (), x)
@@ -25,6 +27,11 @@ def _linear(forth: Callable, back: Callable, x: Any) -> Any:
 def steps(neighbours: Neighbours, s: jax.Array) -> Fluxes:
     """The rise over every link, from its first cell to its second; beyond the map is height 0."""
     return _linear(partial(_steps, neighbours), lambda y: -received(neighbours, y), s)
+
+
+def rises(neighbours: Neighbours, u: jax.Array) -> Fluxes:
+    """`steps` of a map with halo; transposed it leaves the halo alone."""
+    return _linear(partial(_rises, neighbours), lambda y: halo(-received(neighbours, y), 0.0), u)
 
 
 def net(neighbours: Neighbours, flux: Fluxes) -> jax.Array:
@@ -37,6 +44,11 @@ def neighbour(x: jax.Array, di: int, dj: int) -> jax.Array:
     return _linear(lambda x: at(halo(x, 0.0), di, dj), lambda y: at(halo(y, 0.0), -di, -dj), x)
 
 
+def seen(u: jax.Array, di: int, dj: int) -> jax.Array:
+    """What each inner cell of a map with halo sees (di, dj) cells further, at most one."""
+    return _linear(lambda u: at(u, di, dj), lambda y: _placed(y, (1 + di, 1 - di), (1 + dj, 1 - dj)), u)
+
+
 def inner(u: jax.Array) -> jax.Array:
     """A map without its halo."""
     return _linear(at, lambda y: halo(y, 0.0), u)
@@ -45,6 +57,25 @@ def inner(u: jax.Array) -> jax.Array:
 def outer(x: jax.Array) -> jax.Array:
     """A map in a halo of zeros."""
     return _linear(lambda x: halo(x, 0.0), at, x)
+
+
+def window(x: jax.Array, row: int, column: int, rows: int, columns: int) -> jax.Array:
+    """The part of a map that begins with a row and a column."""
+    if (rows, columns) == x.shape[:2]:
+        return x
+
+    def back(y: jax.Array) -> jax.Array:
+        nothing = jnp.zeros((*x.shape[:2], *y.shape[2:]), y.dtype)
+        return lax.dynamic_update_slice(nothing, y, (row, column, *(0,) * (y.ndim - 2)))
+
+    return _linear(lambda x: x[row : row + rows, column : column + columns], back, x)
+
+
+def put(whole: jax.Array, x: jax.Array, first: int) -> jax.Array:
+    """A map with a part of it replaced that begins `first` rows and columns inside."""
+    if x.shape == whole.shape:
+        return x
+    return lax.dynamic_update_slice(whole, x, (first, first, *(0,) * (x.ndim - 2)))
 
 
 def both_ends(neighbours: Neighbours, u: jax.Array) -> tuple[tuple[jax.Array, jax.Array], ...]:
@@ -58,15 +89,21 @@ def spread(x: jax.Array, like: jax.Array) -> jax.Array:
 
 
 def total(y: jax.Array) -> jax.Array:
-    """The sum over the cells of each map; as a product, since XLA sums over leading axes slowly on a CPU."""
-    cells = y.reshape(-1, *y.shape[2:])
-    if cells.ndim == 1:
-        return jnp.sum(cells)
-    return jnp.matmul(jnp.ones(cells.shape[0], y.dtype), cells, precision="highest")
+    """The sum over the cells of each map.
+
+    In a window it is written out: XLA hands sums and products of matrices to a library whose calls cost more than the sum.
+    """
+    if y.ndim == 2 or y.shape[0] > _SMALL:
+        return jnp.sum(y, axis=(0, 1))
+    rows = sum(y[i] for i in range(1, y.shape[0])) + y[0]
+    return sum(rows[j] for j in range(1, rows.shape[0])) + rows[0]
 
 
 def _steps(neighbours: Neighbours, s: jax.Array) -> Fluxes:
-    u = halo(s, 0.0)
+    return _rises(neighbours, halo(s, 0.0))
+
+
+def _rises(neighbours: Neighbours, u: jax.Array) -> Fluxes:
     return tuple(there - here for here, there in _both_ends(neighbours, u))
 
 

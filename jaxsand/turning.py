@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxsand import blade
 from jaxsand.advance import Rest, Step
 from jaxsand.bed import at
-from jaxsand.block import Moving, Way, contact, coordinates
-from jaxsand.frame import Frame, corner
-from jaxsand.resting import bring_to_rest
+from jaxsand.block import Moving, Way
+from jaxsand.frame import Frame
+from jaxsand.resting import bring_to_rest, where_open
 from jaxsand.stencil import inner
 from jaxsand.tool import Pose
 
@@ -41,16 +41,17 @@ class Turn(Step):
         no = jnp.zeros((), bool)
         frame = Frame(_rotated(way.start, sign * begin), no, no, no, self.block.shape)
         after = replace(frame, pose=_rotated(way.start, sign * (begin + ahead)))
-        pose, first = frame.pose, corner(frame, self.block.size, frame.pose.x, frame.pose.y)
+        pose, first = frame.pose, self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
-        now, then = coordinates(self.block.size, frame, first), coordinates(self.block.size, after, first)
+        now, then = self.block.coordinates(frame, first), self.block.coordinates(after, first)
         reach = blade.turned(now, then, way.half, way.side, sign * ahead)
-        near = contact(way, view, inner(reach.swept), old)
-        taken = jnp.where(ahead > 0, blade.cleared(reach, old, way.bottom / way.quantum), 0)
+        among = self.block.contact(way, view, inner(reach.swept), old)
+        taken = jnp.where(ahead > 0, blade.cleared(reach, self.block.part(old), way.bottom / way.quantum), 0)
         face = blade.facing(at(now[1]), sign * ahead) / jnp.maximum(jnp.abs(pose.cos), jnp.abs(pose.sin))
         h, lost = self.block.displaced(way, view, blade.any_way(face * pose.cos, face * pose.sin), old, taken)
-        guess = tuple(f * part for f in sand.flux)
-        new, flux = self.rest(self.block.sand(way, view, reach), way.rate * near * part, self.sweeps, h, guess)
+        around = self.block.sand(way, view, self.block.clear(view), self.block.around(view, reach))
+        guess = where_open(around, tuple(f * part for f in sand.flux))
+        new, flux = self.rest(around, way.rate * among * part, self.sweeps, h, guess)
         gone = None if lost is None else lost + flux[-1]
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))
         return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)

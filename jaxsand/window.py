@@ -28,6 +28,8 @@ class Window:
 
     size: tuple[int, int] = field(metadata={"static": True})
     tolerance: jax.Array | float = 1e-3
+    near: int | None = field(default=None, metadata={"static": True})
+    """How many cells across all lies that the tool covers or touches; the simulator looks where the tool's size is known."""
 
 
 Origin = list[jax.Array]

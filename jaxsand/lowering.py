@@ -1,0 +1,63 @@
+"""A blade is lowered: what it covers leaves radially."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxsand import blade
+from jaxsand.advance import Step
+from jaxsand.bed import at, truncate
+from jaxsand.block import Moving, Way
+from jaxsand.frame import frame_of
+from jaxsand.loop import Plain, repeat_until
+from jaxsand.stencil import inner
+
+
+@dataclass(frozen=True)
+class Lower(Step):
+    """The blade comes down: what it covers leaves radially, until all of it rests."""
+
+    tape: int = 1
+
+    def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
+        frame = frame_of(self.block.shape, way.start)
+        pose, first = frame.pose, self.block.corner(frame.pose.x, frame.pose.y)
+        view, whole = self.block.view(way, frame, first, sand.height)
+        holds, old = self.block.part(view.holds), self.block.part(whole)
+        along, across = self.block.coordinates(frame, first)
+        beside = blade.share(across, -way.side, way.side)
+        cover = inner(blade.straight(along, beside, way.half, jnp.zeros_like(way.length)).after)
+        along, across = inner(along), inner(across)
+        taken = truncate(cover * jnp.maximum(old - way.bottom / way.quantum, 0)) * at(holds)
+        s, n = along / (4 * way.half**2), across / (4 * way.side**2)
+        p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
+        size = jnp.maximum(jnp.abs(p), jnp.abs(q))
+        x, y = along * pose.cos - across * pose.sin, along * pose.sin + across * pose.cos
+        scale = jnp.minimum(jnp.maximum(jnp.abs(x), jnp.abs(y)), 1) / jnp.where(size > 0, size, 1)
+        scale = jnp.where(size > 0, scale, 0)
+        shares = blade.any_way(p * scale, q * scale)
+        over = self.block.over(way, view, old)
+        gone = None if over is None else jnp.zeros_like(old)
+        params = (shares, holds, cover, over)
+        state = (old - taken, gone, taken)
+        (new, gone, carried), _ = repeat_until(_at_rest, Plain(_spread, 16), 2 * self.block.near, params, state)
+        new = self.block.put(whole, new + carried)
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, whole, new, cover))
+        lost = self.block.lose(way, view, sand.lost, None if gone is None else self.block.put(jnp.zeros_like(whole), gone))
+        return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge)
+
+
+def _spread(params: Any, k: jax.Array, state: Any) -> Any:
+    """Sand handed on by one cell: it comes to rest in the open share of cells, and moves on in the rest."""
+    shares, holds, cover, over = params
+    h, gone, carried = state
+    free = None if over is None else (over[0], over[1] * carried)
+    kept, got, lost = blade.handed_on(shares, holds, carried, free)
+    rest = truncate((1 - cover) * got)
+    return h + rest + kept, None if gone is None else gone + lost, got - rest
+
+
+def _at_rest(params: Any, k: jax.Array, state: Any) -> jax.Array:
+    return ~jnp.any(state[2] > 0)
