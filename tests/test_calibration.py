@@ -32,6 +32,11 @@ def collapsed(degrees, before=PILLAR):
     return np.asarray(js.settle(sand(degrees), before).height)
 
 
+def faults(found):
+    """What is wrong but for the grid's error, which is stated."""
+    return found.verdict & ~js.Verdict.GRID_LARGE
+
+
 def off(found, degrees):
     return math.degrees(found.values["repose_angle"]) - degrees
 
@@ -42,10 +47,10 @@ def test_one_noisy_collapse_tells_the_angle_and_how_well():
     for seed in range(24):
         true, guess = 20 + seed * 20 / 23, 15 + (seed * 7 % 31)
         found = js.calibrate(sand(guess), js.Trial(PILLAR, collapsed(true) + noise(seed)), free=ANGLE)
-        assert found.verdict == 0
+        assert not faults(found)
         assert abs(off(found, true)) < 0.2
         assert found.noise == pytest.approx(NOISE, rel=0.1)
-        pulls.append(off(found, true) / math.degrees(found.errors["repose_angle"]))
+        pulls.append(off(found, true) / math.degrees(found.noise_errors["repose_angle"]))
     assert 0.7 < np.std(pulls) < 1.35
     assert abs(np.mean(pulls)) < 0.65  # three of its standard deviations
 
@@ -64,17 +69,17 @@ def test_a_push_tells_the_angle_and_the_blade(push):
     pushed = np.asarray(js.step(sand(31, js.Blade()), LEVEL, STROKE, push=push).height)
     guess = sand(16, js.Blade(0.03, 0.015, 0.00375))
     found = js.calibrate(guess, js.Trial(LEVEL, pushed, STROKE), push=push)
-    assert found.verdict == 0
+    assert not faults(found)
     assert abs(off(found, 31)) < 0.01
     assert found.values["width"] == pytest.approx(0.02, rel=1e-4)
     assert found.model.tool.depth == pytest.approx(0.0075, rel=1e-4)
     noisy = js.calibrate(guess, js.Trial(LEVEL, pushed + noise(1), STROKE), push=push)
-    assert noisy.verdict == 0
+    assert not faults(noisy)
     true = (math.radians(31), 0.02, 0.0075)
-    for value, error, known in zip(noisy.values.values(), noisy.errors.values(), true, strict=True):
+    for value, error, known in zip(noisy.values.values(), noisy.noise_errors.values(), true, strict=True):
         assert abs(value - known) < 4 * error
     # A single default stroke moves too little sand for 0.2 degrees: the bound itself is about half a degree.
-    assert 0.3 < math.degrees(noisy.errors["repose_angle"]) < 0.8
+    assert 0.3 < math.degrees(noisy.noise_errors["repose_angle"]) < 0.8
 
 
 def test_the_errors_are_the_cramer_rao_bound():
@@ -83,7 +88,7 @@ def test_the_errors_are_the_cramer_rao_bound():
     after[:, 20:] = np.nan
     found = js.calibrate(sand(25), js.Trial(PILLAR, after), free=ANGLE, noise=NOISE)
     slope = (collapsed(29.25) - collapsed(28.75))[:, :20] / math.radians(0.5)
-    assert found.errors["repose_angle"] == pytest.approx(NOISE / np.linalg.norm(slope), rel=0.02)
+    assert found.noise_errors["repose_angle"] == pytest.approx(NOISE / np.linalg.norm(slope), rel=0.02)
     assert abs(off(found, 29)) < 0.01
 
 
@@ -97,8 +102,8 @@ def test_regions_have_angles_of_their_own_and_level_sand_tells_none():
     found = js.calibrate(sand(29), js.Trial(pillars.astype(np.float32), after + noise(2)), free=ANGLE, regions=labels)
     for k in (0, 1):
         name = f"repose_angle[{k}]"
-        assert abs(found.values[name] - angles[k]) < 4 * found.errors[name] < math.radians(1.5)
-    assert found.verdict == js.Verdict.NOT_TOLD
+        assert abs(found.values[name] - angles[k]) < 4 * found.noise_errors[name] < math.radians(1.5)
+    assert faults(found) == js.Verdict.NOT_TOLD
     assert found.untold == ("repose_angle[2]",)
     assert found.errors["repose_angle[2]"] == math.inf
     assert found.model.material.repose_angle.shape == SHAPE
@@ -108,7 +113,7 @@ def test_regions_have_angles_of_their_own_and_level_sand_tells_none():
 def test_what_the_data_do_not_tell_is_said():
     guess = sand(25, js.Blade())
     found = js.calibrate(guess, js.Trial(PILLAR, collapsed(29) + noise(3)), free=("depth", "repose_angle"))
-    assert found.verdict == js.Verdict.NOT_TOLD
+    assert faults(found) == js.Verdict.NOT_TOLD
     assert found.untold == ("depth",)
     assert list(found.values) == ["repose_angle", "depth"]
     assert abs(off(found, 29)) < 0.2
@@ -132,7 +137,8 @@ def fitted(residuals, ranges, starts=6, count=50, sigma=None, clean=True):
         begin
     )
     *ends, looks = (np.asarray(part) for part in found)
-    return conclude(ranges, *ends, count, sigma, int(looks.sum()), lambda values: values)
+    own = jax.jit(residuals)
+    return conclude(ranges, *ends, count, sigma, int(looks.sum()), lambda values: values, lambda x: (own(x), own(x), True))
 
 
 def test_a_linear_fit_is_that_of_the_normal_equations():
