@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.finer import OneGrid, TwoGrids, finer, fourfold, isotropic, means, resolve
+from jaxsand.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
 from jaxsand.limit import Reference
 from jaxsand.material import Material
@@ -24,6 +24,7 @@ from jaxsand.tool import NoTool
 Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"
 _TWO = TwoGrids()
+_FINER = 3  # an odd number: cells of both grids have their middles in common
 _ANGLES = (math.radians(10), math.radians(50))
 _Rules = tuple[Push | None, Scheme | None, Stop | None]
 _Group = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # before, after, seen [k, H, W]; strokes [k, n, 4]
@@ -64,7 +65,7 @@ def calibrate(
       starts: how many; those after the first are spread over the ranges.
       push, scheme, stop: as in `jaxsand.step`.
       grid: `TwoGrids()` finds the grid's part of the errors: the fit is repeated with isotropic sand at rest on the scene's
-        grid and on one twice as fine. `OneGrid()` leaves it unknown.
+        grid and on one three times as fine. `OneGrid()` leaves it unknown.
 
     The standard errors hold white noise in `after` and the grid's own error: its spacing, and its neighbourhood, whose error
     no refinement takes away. So the `values` are those of this simulator, `sand` has the sand's own, and the verdict says
@@ -116,18 +117,20 @@ def _climbs(
 
 
 def _reference(scene: Scene, push: Push | None, labels: Any, groups: list[_Group], box: Any, names: Any) -> Reference:
-    """Isotropic sand, brought to rest, on the scene's grid and on one twice as fine."""
+    """Isotropic sand, brought to rest, on the scene's grid and on a finer one."""
     coarse = isotropic(scene)
-    doubled = None if labels is None else fourfold(labels)
+    split = None if labels is None else divide(labels, _FINER)
+    resolved = jax.vmap(lambda before: resolve(scene, before, _FINER))
     grids = (
         (coarse, labels, groups),
-        (finer(coarse), doubled, [(jax.vmap(partial(resolve, scene))(before), *rest) for before, *rest in groups]),
+        (finer(coarse, _FINER), split, [(resolved(before), *rest) for before, *rest in groups]),
     )
 
     def reference(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         values = box[0] + jnp.asarray(x, box.dtype) * (box[1] - box[0])
         (one, clean), (two, also) = (_refers(*some, push, values, names) for some in grids)
-        return np.asarray(one, float), np.asarray(two, float), bool(clean & also)
+        fine = np.asarray(two, float)
+        return fine, (fine - np.asarray(one, float)) / (_FINER - 1), bool(clean & also)
 
     return reference
 

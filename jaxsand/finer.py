@@ -1,4 +1,4 @@
-"""A scene and its maps on a grid twice as fine, and back.
+"""A scene and its maps on a finer grid, and back.
 
 Neighbourhoods of 4 and 8 have an error that no refinement takes away: a pile grown at a point is x1.162 and x1.036 as high
 as the cone. Only isotropic sand converges to it (flux.py), to first order in the spacing.
@@ -19,7 +19,7 @@ from jaxsand.window import Window
 
 @dataclass(frozen=True)
 class TwoGrids:
-    """The grid's error is told from what isotropic sand does on the scene's grid and on one twice as fine."""
+    """The grid's error is told from what isotropic sand does on the scene's grid and on one three times as fine."""
 
 
 @dataclass(frozen=True)
@@ -32,27 +32,27 @@ def isotropic(scene: Scene) -> Scene:
     return replace(scene, grid=replace(scene.grid, neighbours="isotropic"))
 
 
-def finer(scene: Scene) -> Scene:
-    """The scene on half the spacing: every cell is four, with its angle of repose and solid where it is."""
+def finer(scene: Scene, times: int) -> Scene:
+    """The scene on a grid so many times as fine, with the angle of repose of every cell, and solid where it is."""
     rows, columns = scene.grid.shape
-    grid = Grid(scene.grid.spacing / 2, (2 * rows, 2 * columns), scene.grid.neighbours)
+    grid = Grid(scene.grid.spacing / times, (times * rows, times * columns), scene.grid.neighbours)
     material, walls, window = scene.material, scene.walls, scene.window
     if np.ndim(material.repose_angle):
-        material = replace(material, repose_angle=fourfold(material.repose_angle))
+        material = replace(material, repose_angle=divide(material.repose_angle, times))
     if isinstance(walls, Walls):
-        walls = Walls(fourfold(walls.solid))
+        walls = Walls(divide(walls.solid, times))
     if isinstance(window, Window):
-        window = Window((2 * window.size[0], 2 * window.size[1]), window.tolerance * 2)
+        window = Window((times * window.size[0], times * window.size[1]), window.tolerance * times)
     return replace(scene, grid=grid, material=material, walls=walls, window=window)
 
 
-def fourfold(cells: Any) -> jax.Array:
-    """A map [..., H, W] with every cell repeated: [..., 2 H, 2 W]."""
-    return jnp.repeat(jnp.repeat(jnp.asarray(cells), 2, axis=-2), 2, axis=-1)
+def divide(cells: Any, times: int) -> jax.Array:
+    """A map [H, W] with every cell divided into times^2: [times H, times W]."""
+    return jnp.repeat(jnp.repeat(jnp.asarray(cells), times, axis=0), times, axis=1)
 
 
-def resolve(scene: Scene, height: jax.Array) -> jax.Array:
-    """A map [H, W] of the scene as means over cells half as wide, [2 H, 2 W].
+def resolve(scene: Scene, height: jax.Array, times: int) -> jax.Array:
+    """A map [H, W] of the scene as means over the cells of a grid so many times as fine, [times H, times W].
 
     Each cell is a plane through its mean, along x and along y with the lesser of the differences to both sides, level where
     these have different signs (van Leer 1979, doi:10.1016/0021-9991(79)90145-1, with minmod): means are kept, steps stay
@@ -60,10 +60,10 @@ def resolve(scene: Scene, height: jax.Array) -> jax.Array:
     """
     rows, columns = height.shape
     sand = jnp.where(scene.walls.solid, jnp.nan, height) if isinstance(scene.walls, Walls) else height
-    quarters = jnp.asarray([-0.25, 0.25], height.dtype)
-    along_y = fourfold(_slope(sand, 0)) * jnp.tile(quarters, rows)[:, None]
-    along_x = fourfold(_slope(sand, 1)) * jnp.tile(quarters, columns)[None, :]
-    return fourfold(height) + along_y + along_x
+    off = jnp.asarray((np.arange(times) + 0.5) / times - 0.5, height.dtype)
+    along_y = divide(_slope(sand, 0), times) * jnp.tile(off, rows)[:, None]
+    along_x = divide(_slope(sand, 1), times) * jnp.tile(off, columns)[None, :]
+    return divide(height, times) + along_y + along_x
 
 
 def _slope(height: jax.Array, axis: int) -> jax.Array:
@@ -74,7 +74,7 @@ def _slope(height: jax.Array, axis: int) -> jax.Array:
 
 
 def means(height: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """The means of a map [..., k H, k W] over the cells of a grid of `shape` (H, W)."""
+    """The means of maps [..., k H, k W] over the cells of a grid of `shape` (H, W)."""
     rows, columns = shape
     parts = height.reshape(*height.shape[:-2], rows, height.shape[-2] // rows, columns, height.shape[-1] // columns)
     return parts.mean((-3, -1))

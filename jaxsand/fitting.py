@@ -236,7 +236,7 @@ def conclude(
         verdict |= Verdict.GRID_UNKNOWN
         shift = rest = np.full(x.shape, np.nan)
     else:
-        shift, rest = (limit.x - x) * scale, limit.rest * scale
+        shift, rest = (limit.x - x) * scale, limit.doubt * scale
     grid_errors = np.where(hidden, np.nan, np.hypot(shift, rest))
     if np.any(grid_errors > noise_errors):
         verdict |= Verdict.GRID_LARGE

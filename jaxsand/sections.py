@@ -100,6 +100,10 @@ def calibrate_sections(
     begin = 1 + np.clip(spread(ranges, starts), 0.01, 0.99)
     ends = [least_squares(residuals, x, "3-point", bounds=(1, 2), diff_step=_STEP, xtol=1e-6, ftol=1e-8) for x in begin]
 
+    def reference(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        fine = residuals(1 + x, halved)
+        return fine, fine - residuals(1 + x), True
+
     def passes(values: np.ndarray) -> tuple[Pass, ...]:
         return tuple(_placed(section.run, k, keys, values)[0] for k, section in enumerate(some))
 
@@ -114,7 +118,7 @@ def calibrate_sections(
         noise,
         calls,
         passes,
-        lambda x: (residuals(1 + x), residuals(1 + x, halved), True),
+        reference,
     )
 
 
