@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.calibbench import bench_calibrate
+from jaxsand.calibbench import bench_calibrate, bench_cone, cone
 from jaxsand.fitting import Range, climb, conclude, spread
 from jaxsand.trench import Pass, closed_form, relaxed
 
@@ -61,6 +61,83 @@ def test_the_bench_finds_errors_as_large_as_stated():
     for row in bench_calibrate(seeds=6):
         assert 0.4 < row["rms_error_deg"] / row["standard_error_deg"] < 1.7
         assert row["rms_error_deg"] <= row["worst_error_deg"]
+
+
+def check_cones(rows):
+    """The cone's angle lies within two stated errors, where two of the noise's reach it nowhere; so does the sand's own."""
+    assert [row["neighbours"] for row in rows] == [4, 8, "isotropic"]
+    for row, angle in zip(rows, (24.3, 27.9, 30.0), strict=True):
+        assert row["angle_deg"] == pytest.approx(angle, abs=0.15)  # what is off: the grid, not the noise
+        assert row["noise_error_deg"] < 0.2
+        assert row["covered_by_noise"] == 0
+        assert row["covered"] >= 0.95
+        assert row["sand_covered"] >= 0.95
+        assert row["sand_deg"] == pytest.approx(29, abs=0.15)
+        assert row["sand_error_deg"] < 0.3
+
+
+def test_the_exact_cones_angle_lies_within_two_stated_errors():
+    check_cones(bench_cone(seeds=4))
+
+
+@pytest.mark.slow
+def test_the_exact_cones_angle_lies_within_two_stated_errors_in_95_of_100_trials():
+    check_cones(bench_cone(seeds=100))
+
+
+def ridge(degrees, half, height):
+    """A block's exact end in one dimension, as means over cells, and the block."""
+    mu, parts = math.tan(math.radians(degrees)), 64
+    x = np.abs((np.arange(32 * parts) + 0.5) / parts * DX - 0.16)
+    toe = half + height / 2 / mu if height <= 2 * mu * half else math.sqrt(2 * half * height / mu)
+    rows = (np.where(x < half, height, 0), np.clip(mu * (toe - x), 0, height))
+    return (np.tile(row.reshape(32, parts).mean(1), (32, 1)).astype(np.float32) for row in rows)
+
+
+@pytest.mark.parametrize("neighbours", [4, 8])
+def test_ridges_and_slots_have_small_error_bars_that_hold_the_exact_angle(neighbours):
+    """One dimension: neighbourhoods agree, and what is left is where a toe and a crest lie in their cells."""
+    scene, errors = js.make_scene(SHAPE, DX, math.radians(26), neighbours), []
+    rng, covered = np.random.default_rng(1), 0
+    for k in range(20):
+        degrees, half, height = rng.uniform(22, 38), rng.integers(3, 8) * DX, rng.uniform(0.02, 0.05)
+        before, after = ((-1) ** k * h for h in ridge(degrees, half, height))
+        found = js.calibrate(scene, js.Trial(before, after + noise(k)), free=ANGLE, noise=NOISE)
+        assert not faults(found)
+        error = math.degrees(found.errors["repose_angle"])
+        covered += abs(off(found, degrees)) <= 2 * error
+        errors.append(error)
+    assert covered >= 19
+    assert np.median(errors) < 0.6
+
+
+def test_the_grids_error_is_told_through_gaps():
+    """Half of the cone unseen: the same error of the grid."""
+    before, after = cone(29.0)
+    scene, half = js.make_scene(SHAPE, DX, 0.45), after + noise(0)
+    half[:, :16] = np.nan
+    whole, gaps = (js.calibrate(scene, js.Trial(before, a), free=ANGLE, noise=NOISE) for a in (after + noise(0), half))
+    assert gaps.grid_errors["repose_angle"] == pytest.approx(whole.grid_errors["repose_angle"], rel=0.2)
+    assert abs(math.degrees(gaps.sand["repose_angle"]) - 29) <= 2 * math.degrees(gaps.sand_errors["repose_angle"])
+    assert gaps.errors["repose_angle"] == pytest.approx(
+        math.hypot(gaps.noise_errors["repose_angle"], gaps.grid_errors["repose_angle"])
+    )
+    assert gaps.covariance[0, 0] == pytest.approx(gaps.errors["repose_angle"] ** 2)
+
+
+def test_an_error_that_is_not_known_is_no_number():
+    """Left out, or with the sand's own angle beyond the range."""
+    before, after = cone(29.0)
+    trial, scene = js.Trial(before, after + noise(0)), js.make_scene(SHAPE, DX, 0.45)
+    narrow = {"repose_angle": (math.radians(26), math.radians(28.5))}
+    for found in (
+        js.calibrate(scene, trial, free=ANGLE, grid=js.OneGrid()),
+        js.calibrate(scene, trial, free=narrow),
+    ):
+        assert found.verdict == js.Verdict.GRID_UNKNOWN
+        assert found.noise_errors["repose_angle"] > 0
+        for part in (found.errors, found.grid_errors, found.sand, found.sand_errors):
+            assert math.isnan(part["repose_angle"])
 
 
 @pytest.mark.parametrize("push", [js.SwathPush(), pytest.param(js.SteppedPush(), marks=pytest.mark.slow)])
@@ -225,6 +302,7 @@ REFUSED = {
     "a number for a push": (lambda: js.calibrate(BLADE, TRIAL, push=3), "push: got 3; give SteppedPush"),
     "a name for noise": (lambda: js.calibrate(BLADE, TRIAL, noise="a"), "noise: got 'a'"),
     "a silent noise": (lambda: js.calibrate(BLADE, TRIAL, noise=0.0), "noise: got 0.0"),
+    "a number for a grid": (lambda: js.calibrate(BLADE, TRIAL, grid=2), r"grid: got 2; give TwoGrids"),
     "no starts": (lambda: js.calibrate(BLADE, TRIAL, starts=0), "starts: got 0"),
     "labels of floats": (lambda: js.calibrate(BLADE, TRIAL, regions=LEVEL), "regions: got float32"),
     "labels with gaps": (lambda: js.calibrate(BLADE, TRIAL, regions=2 * (X > 0.1)), "number the regions 0, 1"),
