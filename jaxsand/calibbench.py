@@ -1,5 +1,5 @@
-"""How well noisy height maps tell the angle of repose: of simulated sand, beside the least error that any estimator can have,
-and of a cone that is known exactly, beside the error that is stated."""
+"""How well noisy height maps tell the angle of repose: of simulated sand, beside the least error that any estimator
+can have, and of a cone that is known exactly, beside the error that is stated."""
 
 import math
 import time
