@@ -145,18 +145,30 @@ def test_a_push_tells_the_angle_and_the_blade(push):
     """To rounding without noise, from lengths off by half; within four standard errors with it."""
     pushed = np.asarray(js.step(sand(31, js.Blade()), LEVEL, STROKE, push=push).height)
     guess = sand(16, js.Blade(0.03, 0.015, 0.00375))
-    found = js.calibrate(guess, js.Trial(LEVEL, pushed, STROKE), push=push)
-    assert not faults(found)
+    found = js.calibrate(guess, js.Trial(LEVEL, pushed, STROKE), push=push, grid=js.OneGrid())
+    assert found.verdict == js.Verdict.GRID_UNKNOWN
     assert abs(off(found, 31)) < 0.01
     assert found.values["width"] == pytest.approx(0.02, rel=1e-4)
     assert found.model.tool.depth == pytest.approx(0.0075, rel=1e-4)
-    noisy = js.calibrate(guess, js.Trial(LEVEL, pushed + noise(1), STROKE), push=push)
-    assert not faults(noisy)
+    noisy = js.calibrate(guess, js.Trial(LEVEL, pushed + noise(1), STROKE), push=push, grid=js.OneGrid())
+    assert noisy.verdict == js.Verdict.GRID_UNKNOWN
     true = (math.radians(31), 0.02, 0.0075)
     for value, error, known in zip(noisy.values.values(), noisy.noise_errors.values(), true, strict=True):
         assert abs(value - known) < 4 * error
     # A single default stroke moves too little sand for 0.2 degrees: the bound itself is about half a degree.
     assert 0.3 < math.degrees(noisy.noise_errors["repose_angle"]) < 0.8
+
+
+@pytest.mark.slow
+def test_the_grids_error_of_a_push_is_told():
+    """A blade of six cells tells how far two grids put angle and depth off: by more than the noise does."""
+    blade = js.Blade(0.06, 0.02, 0.02)
+    pushed = np.asarray(js.step(sand(31, blade), LEVEL, STROKE, push=js.SwathPush()).height)
+    trial, free = js.Trial(LEVEL, pushed + noise(1), STROKE), ("repose_angle", "depth")
+    found = js.calibrate(sand(26, blade), trial, free=free, noise=NOISE, push=js.SwathPush())
+    assert found.verdict == js.Verdict.GRID_LARGE
+    for name in free:
+        assert 0 < found.noise_errors[name] < found.grid_errors[name] < found.errors[name] < found.values[name] / 3
 
 
 def test_the_errors_are_the_cramer_rao_bound():
