@@ -98,12 +98,14 @@ def bench(
         report["sand"] = sandbench.bench_sand(tell, seed=seed)
     if what == "strokes":
         report |= strokebench.bench_strokes(tell, **strokes)
+    if what == "calibrate":
+        report["calibrate"] = calibbench.bench_calibrate(tell)
+        report["calibrate_cone"] = calibbench.bench_cone(tell)
     if what == "trench":
         report["trench_by_spacing"] = rutbench.against_spacing(tell, grids + 1)
         report["trench_settles"] = rutbench.settling(tell)
     of_one_table = {
         "env": lambda: envbench.bench_env(batch, tell),
-        "calibrate": lambda: calibbench.bench_calibrate(tell),
         "stability": lambda: stability.stability(tell=tell),
         "letters": lambda: bench_letters(tell),
     }

@@ -10,7 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
+from jaxsand.limit import Reference
 from jaxsand.material import Material
 from jaxsand.rules import Stop, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, concrete, fit
@@ -21,6 +23,8 @@ from jaxsand.tool import NoTool
 
 Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"
+_TWO = TwoGrids()
+_FINER = 3  # an odd number: cells of both grids have their middles in common
 _ANGLES = (math.radians(10), math.radians(50))
 _Rules = tuple[Push | None, Scheme | None, Stop | None]
 _Group = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # before, after, seen [k, H, W]; strokes [k, n, 4]
@@ -47,6 +51,7 @@ def calibrate(
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
+    grid: TwoGrids | OneGrid = _TWO,
 ) -> Calibration[Scene]:
     """The parameters with which the simulator best explains what was seen, in least squares over all cells of all trials.
 
@@ -59,10 +64,14 @@ def calibrate(
       noise: sigma (m) of the white noise in `after`; by default it is estimated from the residual.
       starts: how many; those after the first are spread over the ranges.
       push, scheme, stop: as in `jaxsand.step`.
+      grid: `TwoGrids()` finds the grid's part of the errors: the fit is repeated with isotropic sand at rest on the scene's
+        grid and on one three times as fine. `OneGrid()` leaves it unknown.
 
-    The standard errors are those of white noise in `after`. Errors of the model are not in them: its spacing, its rule of
-    pushing, noise in `before`. Computes in the dtype of the maps; float32 will do. To learn what an experiment could tell
-    before it is made, give its own simulated `after`, and the noise: the errors are then the Cramer-Rao bound.
+    The standard errors hold white noise in `after` and the grid's own error: its spacing, and its neighbourhood, whose error
+    no refinement takes away. So the `values` are those of this simulator, `sand` has the sand's own, and the verdict says
+    GRID_LARGE where these differ by more than noise. Other errors of the model are not in the errors: its rule of pushing,
+    noise in `before`. Computes in the dtype of the maps; float32 will do. To learn what an experiment could tell before it
+    is made, give its own simulated `after`, and the noise: `noise_errors` are then the Cramer-Rao bound.
 
     Raises:
       ValueError: names the field, the value and the remedy. Data that do not tell a parameter, or that no parameters
@@ -74,6 +83,8 @@ def calibrate(
     check_rule(scene, scheme, stop)
     if push is not None:
         check_push(push)
+    if not isinstance(grid, TwoGrids | OneGrid):
+        raise ValueError(f"grid: got {grid!r}; give TwoGrids() or OneGrid()")
     groups, seen = _grouped(scene, some)
     labels = _labels(scene, regions)
     ranges, names = _ranges(scene, free, 0 if labels is None else int(labels.max()) + 1)
@@ -89,7 +100,9 @@ def calibrate(
     def model(values: np.ndarray) -> Scene:
         return _with(scene, names, labels, jnp.asarray(values, dtype))
 
-    return conclude(ranges, ends, costs, jacobians, clean, done, seen, noise, int(count.sum()) * len(some), model)
+    calls = int(count.sum()) * len(some)
+    reference = _reference(scene, push, labels, groups, box, names) if isinstance(grid, TwoGrids) else None
+    return conclude(ranges, ends, costs, jacobians, clean, done, seen, noise, calls, model, reference)
 
 
 @partial(jax.jit, static_argnames="names")
@@ -98,14 +111,44 @@ def _climbs(
 ) -> Any:
     def residuals(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = _with(scene, names, labels, box[0] + x * (box[1] - box[0]))
-        misfits, outcomes = [], []
-        for before, after, sees, strokes in groups:
-            height, outcome = _run(there, rules, before, strokes)
-            misfits.append(jnp.where(sees, height - after, 0).ravel())
-            outcomes.append(outcome)
-        return jnp.concatenate(misfits), jnp.all(jnp.concatenate(outcomes) == 0)
+        return _misfits(there, rules, groups)
 
     return climb(residuals, begin, sum(before.size for before, *_ in groups), seen, noise)
+
+
+def _reference(scene: Scene, push: Push | None, labels: Any, groups: list[_Group], box: Any, names: Any) -> Reference:
+    """Isotropic sand, brought to rest, on the scene's grid and on a finer one."""
+    coarse = isotropic(scene)
+    split = None if labels is None else divide(labels, _FINER)
+    resolved = jax.vmap(lambda before: resolve(scene, before, _FINER))
+    grids = (
+        (coarse, labels, groups),
+        (finer(coarse, _FINER), split, [(resolved(before), *rest) for before, *rest in groups]),
+    )
+
+    def reference(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        values = box[0] + jnp.asarray(x, box.dtype) * (box[1] - box[0])
+        (one, clean), (two, also) = (_refers(*some, push, values, names) for some in grids)
+        fine = np.asarray(two, float)
+        return fine, (fine - np.asarray(one, float)) / (_FINER - 1), bool(clean & also)
+
+    return reference
+
+
+@partial(jax.jit, static_argnames="names")
+def _refers(scene: Scene, labels: Any, groups: list[_Group], push: Push | None, values: Any, names: Any) -> Any:
+    return _misfits(_with(scene, names, labels, values), (push, None, None), groups)
+
+
+def _misfits(scene: Scene, rules: _Rules, groups: list[_Group]) -> tuple[jax.Array, jax.Array]:
+    """What the scene makes of the maps before less what was seen, in the cells that were seen, and whether it is clean; the
+    scene's cells may be parts of these."""
+    misfits, outcomes = [], []
+    for before, after, sees, strokes in groups:
+        height, outcome = _run(scene, rules, before, strokes)
+        misfits.append(jnp.where(sees, means(height, sees[0].shape) - after, 0).ravel())
+        outcomes.append(outcome)
+    return jnp.concatenate(misfits), jnp.all(jnp.concatenate(outcomes) == 0)
 
 
 def _run(scene: Scene, rules: _Rules, before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:

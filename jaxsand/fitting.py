@@ -2,8 +2,10 @@
 
 The cost sum r(x)^2 of residuals r (m) is brought down by Gauss-Newton steps (J^T J + damping D) dx = -J^T r, D the diagonal
 of J^T J (Levenberg 1944, Marquardt 1963, doi:10.1137/0111030). Parameters are measured in their ranges, x from 0 to 1, and
-stay there. The covariance is sigma^2 (J^T J)^-1, that of white noise sigma to first order, which is also the Cramer-Rao
-bound.
+stay there. An error bar has two parts. The noise's covariance is sigma^2 (J^T J)^-1, that of white noise sigma to first
+order, which is also the Cramer-Rao bound. The grid's is d d^T + e e^T, with d the way from the fit to where it would end on
+an ever finer grid, and e what may be wrong of d (limit.py): the same in every repetition of an experiment, and in one
+proportion for all parameters.
 """
 
 import math
@@ -16,6 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+
+from jaxsand.limit import Reference, seek_limit
 
 Model = TypeVar("Model")
 _LOOKS = 40
@@ -42,19 +46,36 @@ class Verdict(IntFlag):
     """The simulator's outcome is not clean at the estimate (see `jaxsand.check`), or a section's model ends next to it."""
     FEW_DATA = 64
     """The noise was estimated from fewer than 20 numbers more than are free: the errors may be far off; give `noise`."""
+    GRID_LARGE = 128
+    """Of some parameter the grid's part of the error is larger than the noise's: the values are those of the simulator on
+    its grid, and `sand` has what they would be without one."""
+    GRID_UNKNOWN = 256
+    """The grid's part of the errors was not asked for, or could not be found (the reference was not clean, or left the
+    ranges): `errors` are NaN, and `noise_errors` the noise's part alone."""
 
 
 @dataclass(frozen=True)
 class Calibration(Generic[Model]):
     """What was found: `values` and standard `errors` by name, in SI units and rad, and their `covariance` in that order.
 
+    The values are the model's, on its own grid: with them it best explains the data. The errors say how far the sand's own
+    may be from them, errors^2 = noise_errors^2 + grid_errors^2. `sand` has the values without the grid's error, found from
+    two grids of a model that converges, and `sand_errors` how well they are known: the noise's part, and half of what was
+    extrapolated.
+
     `untold` parameters have infinite errors. `residual` is the rms misfit (m), `noise` the sigma (m) on which the errors
-    rest, `calls` how often the model was run, `model` the model with the values put in.
+    rest, `calls` how often the model was run, `model` the model with the values put in. `noise_covariance` is the noise's
+    part of the covariance. Where the grid's part is unknown it is NaN, and what holds it too.
     """
 
     values: dict[str, float]
     errors: dict[str, float]
+    noise_errors: dict[str, float]
+    grid_errors: dict[str, float]
+    sand: dict[str, float]
+    sand_errors: dict[str, float]
     covariance: np.ndarray
+    noise_covariance: np.ndarray
     untold: tuple[str, ...]
     residual: float
     noise: float
@@ -178,8 +199,10 @@ def conclude(
     noise: float | None,
     calls: int,
     model: Callable[[np.ndarray], Model],
+    reference: Reference | None,
 ) -> Calibration[Model]:
-    """The best of several climbs, and what is to be said of it; `model` makes one of values."""
+    """The best of several climbs, and what is to be said of it; `model` makes one of values, and `reference` tells how far
+    the grid puts them off."""
     costs = np.nan_to_num(costs.astype(float), nan=1e30, posinf=1e30)
     best = int(np.argmin(costs))
     x, cost, jacobian = ends[best].astype(float), float(costs[best]), np.nan_to_num(jacobians[best].astype(float))
@@ -205,15 +228,37 @@ def conclude(
         verdict |= Verdict.FEW_DATA
     if noise is not None and cost / noise**2 > spare + 5 * math.sqrt(2 * spare):
         verdict |= Verdict.POOR_FIT
-    values = low + x * (high - low)
+    values, scale = low + x * (high - low), high - low
+    noise_errors = np.sqrt(np.diag(covariance))
+    way = (ways[:, told] / curves[told]) @ ways[:, told].T @ jacobian.T / max(sigma**2, 1e-30)
+    limit = None if reference is None else seek_limit(x, way, noise_errors / scale, ~hidden, reference)
+    if limit is None:
+        verdict |= Verdict.GRID_UNKNOWN
+        shift = rest = np.full(x.shape, np.nan)
+    else:
+        shift, rest = (limit.x - x) * scale, limit.doubt * scale
+    grid_errors = np.where(hidden, np.nan, np.hypot(shift, rest))
+    if np.any(grid_errors > noise_errors):
+        verdict |= Verdict.GRID_LARGE
+    total = covariance + np.outer(shift, shift) + np.outer(rest, rest)
+    total[hidden, hidden] = np.inf
+
+    def named(numbers: np.ndarray) -> dict[str, float]:
+        return dict(zip(names, numbers.tolist(), strict=True))
+
     return Calibration(
-        dict(zip(names, values.tolist(), strict=True)),
-        dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-        covariance,
-        tuple(name for name, yes in zip(names, hidden, strict=True) if yes),
-        math.sqrt(cost / seen),
-        sigma,
-        calls,
-        verdict if clean[best] else verdict | Verdict.UNCLEAN,
-        model(values),
+        values=named(values),
+        errors=named(np.sqrt(np.diag(total))),
+        noise_errors=named(noise_errors),
+        grid_errors=named(grid_errors),
+        sand=named(values + shift),
+        sand_errors=named(np.hypot(noise_errors, rest)),
+        covariance=total,
+        noise_covariance=covariance,
+        untold=tuple(name for name, yes in zip(names, hidden, strict=True) if yes),
+        residual=math.sqrt(cost / seen),
+        noise=sigma,
+        calls=calls,
+        verdict=verdict if clean[best] else verdict | Verdict.UNCLEAN,
+        model=model(values),
     )

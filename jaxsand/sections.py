@@ -61,8 +61,9 @@ def calibrate_sections(
         1 mm, `trench.relaxing()`. `trench.closed_form` is a hundred times as fast, and another profile where the wheel is
         deep in the sand and slips.
 
-    The standard errors are those of white noise in z. What the model leaves out of a trench is not in them. Next to where
-    a model has no profile they are worth nothing, and the verdict says UNCLEAN.
+    The standard errors hold white noise in z and, of the exact relaxation, the error of its cells, found from cells of half
+    the size. A `model` that you give is taken to have no grid. What the model leaves out of a trench is not in the errors.
+    Next to where a model has no profile they are worth nothing, and the verdict says UNCLEAN.
 
     Raises:
       ValueError: names the field, the value and the remedy; a bad fit raises nothing, its `verdict` says so.
@@ -79,9 +80,10 @@ def calibrate_sections(
     if count <= len(ranges):
         raise ValueError(f"sections: got {count} seen points for {len(ranges)} free parameters; give more, or free fewer")
     profile = relaxing() if model is None else model
+    halved = relaxing(spacing=5e-4) if model is None else model
     calls = 0
 
-    def residuals(x: np.ndarray) -> np.ndarray:
+    def residuals(x: np.ndarray, profile: Callable[[Pass], Profile] = profile) -> np.ndarray:
         nonlocal calls
         values, misfits = low + (x - 1) * (high - low), []
         for k, (section, sees) in enumerate(zip(some, seen, strict=True)):
@@ -98,6 +100,10 @@ def calibrate_sections(
     begin = 1 + np.clip(spread(ranges, starts), 0.01, 0.99)
     ends = [least_squares(residuals, x, "3-point", bounds=(1, 2), diff_step=_STEP, xtol=1e-6, ftol=1e-8) for x in begin]
 
+    def reference(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        fine = residuals(1 + x, halved)
+        return fine, fine - residuals(1 + x), True
+
     def passes(values: np.ndarray) -> tuple[Pass, ...]:
         return tuple(_placed(section.run, k, keys, values)[0] for k, section in enumerate(some))
 
@@ -112,6 +118,7 @@ def calibrate_sections(
         noise,
         calls,
         passes,
+        reference,
     )
 
 

@@ -11,9 +11,9 @@ README = Path(__file__).parent.parent / "README.md"
 
 # A file imports only from floors below its own, and never from a neighbour. A folder has a floor, and floors inside.
 FLOORS = [
-    {"grid", "material", "walls", "window", "tool", "lockstep", "fitting", "turns"},
-    {"scene", "loop"},
-    {"bed", "schemes", "forces"},
+    {"grid", "material", "walls", "window", "tool", "lockstep", "limit", "turns"},
+    {"scene", "loop", "fitting"},
+    {"bed", "schemes", "forces", "finer"},
     {"flux", "rules", "adjoint"},
     {"sweep"},
     {"around"},
