@@ -68,10 +68,10 @@ def calibrate(
         grid and on one three times as fine. `OneGrid()` leaves it unknown.
 
     The standard errors hold white noise in `after` and the grid's own error: its spacing, and its neighbourhood, whose error
-    no refinement takes away. So the `values` are those of this simulator, `sand` has the sand's own, and the verdict says
-    GRID_LARGE where these differ by more than noise. Other errors of the model are not in the errors: its rule of pushing,
-    noise in `before`. Computes in the dtype of the maps; float32 will do. To learn what an experiment could tell before it
-    is made, give its own simulated `after`, and the noise: `noise_errors` are then the Cramer-Rao bound.
+    no refinement takes away. So the `values` are those of this simulator, and `sand` has the sand's own. Where the grid's
+    part could not be found the verdict says GRID_UNKNOWN. Other errors of the model are not in the errors: its rule of
+    pushing, noise in `before`. Computes in the dtype of the maps; float32 will do. To learn what an experiment could tell
+    before it is made, give its own simulated `after`, and the noise: `noise_errors` are then the Cramer-Rao bound.
 
     Raises:
       ValueError: names the field, the value and the remedy. Data that do not tell a parameter, or that no parameters

@@ -46,12 +46,9 @@ class Verdict(IntFlag):
     """The simulator's outcome is not clean at the estimate (see `jaxsand.check`), or a section's model ends next to it."""
     FEW_DATA = 64
     """The noise was estimated from fewer than 20 numbers more than are free: the errors may be far off; give `noise`."""
-    GRID_LARGE = 128
-    """Of some parameter the grid's part of the error is larger than the noise's: the values are those of the simulator on
-    its grid, and `sand` has what they would be without one."""
-    GRID_UNKNOWN = 256
+    GRID_UNKNOWN = 128
     """The grid's part of the errors was not asked for, or could not be found (the reference was not clean, or left the
-    ranges): `errors` are NaN, and `noise_errors` the noise's part alone."""
+    ranges): `grid_errors` and `sand` are NaN, and `errors` hold the noise's part alone."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,8 @@ class Calibration(Generic[Model]):
 
     `untold` parameters have infinite errors. `residual` is the rms misfit (m), `noise` the sigma (m) on which the errors
     rest, `calls` how often the model was run, `model` the model with the values put in. `noise_covariance` is the noise's
-    part of the covariance. Where the grid's part is unknown it is NaN, and what holds it too.
+    part of the covariance. Where the grid's part is unknown, `grid_errors`, `sand` and `sand_errors` are NaN, the others
+    hold the noise's part alone, and the verdict says GRID_UNKNOWN.
     """
 
     values: dict[str, float]
@@ -232,15 +230,14 @@ def conclude(
     noise_errors = np.sqrt(np.diag(covariance))
     way = (ways[:, told] / curves[told]) @ ways[:, told].T @ jacobian.T / max(sigma**2, 1e-30)
     limit = None if reference is None else seek_limit(x, way, noise_errors / scale, ~hidden, reference)
+    total = covariance.copy()
     if limit is None:
         verdict |= Verdict.GRID_UNKNOWN
         shift = rest = np.full(x.shape, np.nan)
     else:
         shift, rest = (limit.x - x) * scale, limit.doubt * scale
+        total += np.outer(shift, shift) + np.outer(rest, rest)
     grid_errors = np.where(hidden, np.nan, np.hypot(shift, rest))
-    if np.any(grid_errors > noise_errors):
-        verdict |= Verdict.GRID_LARGE
-    total = covariance + np.outer(shift, shift) + np.outer(rest, rest)
     total[hidden, hidden] = np.inf
 
     def named(numbers: np.ndarray) -> dict[str, float]:
