@@ -103,7 +103,7 @@ def _loop(loop: lockstep.Lanes, params: Tree, state: Tree) -> tuple[Tree, jax.Ar
 
 @_loop.defjvp
 def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
-    params, state = _first_order(primals)
+    params, state = first_order(primals)
     dparams, dstate = tangents
     dparams = tuple(d for d in jax.tree.leaves(dparams) if d.dtype != jax.dtypes.float0)
     end, count, tape, saved = lockstep.batched(lockstep.record, loop, params, state)
@@ -128,11 +128,12 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
 
 
 @jax.custom_jvp
-def _first_order(tree: Tree) -> Tree:
+def first_order(tree: Tree) -> Tree:
+    """The same; what is differentiated through it cannot be differentiated again."""
     return tree
 
 
-@_first_order.defjvp
+@first_order.defjvp
 def _refuse(primals: Tree, tangents: Tree) -> Tree:
     raise NotImplementedError(
         "second derivatives through settling or pushing are not available; differentiate once, "

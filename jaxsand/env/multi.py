@@ -115,6 +115,9 @@ class MultiStroke:
     simulator's "outcome"; a push that leaves no finite map leaves the map as it was.
 
     `push` is the full push or the fast one, `SwathPush()`; `settle` its stop rule, by default until still.
+
+    A reward is differentiable once, in forward and reverse mode, in the action, the state's maps and the scene's floats (not
+    where the map is the goal to the last bit, nor in the fifth number of a `Stop`), whatever the batching.
     """
 
     push: Push = field(default_factory=SteppedPush)
