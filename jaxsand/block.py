@@ -159,8 +159,8 @@ def coordinates(size: int, frame: Frame, first: tuple[jax.Array, jax.Array]) -> 
     """How far ahead of a pose, and to its left, the cells of a block and its halo lie (spacings)."""
     like = jnp.zeros((size + 2, size + 2, *frame.pose.x.shape), frame.pose.x.dtype)
     pose = jax.tree.map(lambda x: spread(x, like), frame.pose)
-    x = numbers(size + 2, 1, first[0]) + (first[0] - 0.5) - pose.x
-    y = numbers(size + 2, 0, first[1]) + (first[1] - 0.5) - pose.y
+    x = numbers(size + 2, 1, frame.pose.x) + (first[0].astype(like.dtype) - 0.5) - pose.x
+    y = numbers(size + 2, 0, frame.pose.x) + (first[1].astype(like.dtype) - 0.5) - pose.y
     return x * pose.cos + y * pose.sin, y * pose.cos - x * pose.sin
 
 

@@ -13,7 +13,7 @@ from jaxsand.bed import Bed, Lost, at, halo, largest, mark, nothing_lost, prepar
 from jaxsand.flux import Nothing, middle, steepest, worst_excess
 from jaxsand.levels import descend, start
 from jaxsand.march import March, Sand, march
-from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window
+from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
 from jaxsand.scene import Scene, cast, fit
 from jaxsand.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
 from jaxsand.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
@@ -117,10 +117,10 @@ def _judge(
     marked, broken = mark(scene, height)
     residual = worst_excess(bed, u)
     broken = broken | spoiled(marked, at(u)) | ~sound(bed)
-    still = Outcome.NOT_STILL * (residual > stop.tolerance)
-    outcome = still + Outcome.WINDOW_EDGE * touched + Outcome.NOT_FINITE * broken
+    still = said(Outcome.NOT_STILL, residual > stop.tolerance)
+    outcome = still | said(Outcome.WINDOW_EDGE, touched) | said(Outcome.NOT_FINITE, broken)
     settled = unmark(at(u), height)
-    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), volume_lost(bed, lost))
+    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome, volume_lost(bed, lost))
 
 
 def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tuple[Sand, jax.Array]:
