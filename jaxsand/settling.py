@@ -92,9 +92,12 @@ def settle_batch(
 
 def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     """The tangent of the steepest slope between neighbours of a map [H, W]."""
-    scene, height = fit(scene, height)
-    marked, _ = mark(scene, height)
-    return steepest(prepare(scene), halo(marked))
+    return _steepest(*fit(scene, height))
+
+
+@jax.jit
+def _steepest(scene: Scene, height: jax.Array) -> jax.Array:
+    return steepest(prepare(scene), halo(mark(scene, height)[0]))
 
 
 def relax(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE) -> Settled:
