@@ -84,7 +84,8 @@ class Advance(Step):
     rest: Rest = bring_to_rest
 
     def arrived(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
-        return (k >= self.lowered) & jnp.all((k - self.lowered) * (self.chunk * self.substep) >= way.length)
+        gone = (k - int(self.lowered)).astype(way.length.dtype) * (self.chunk * self.substep)
+        return (k >= int(self.lowered)) & jnp.all(gone >= way.length)
 
     def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
         return self.recorded(way, k, sand)[0]
@@ -118,7 +119,7 @@ class Advance(Step):
         """Where the block of step k begins, and by how much that has moved."""
         begins = []
         for j in (jnp.maximum(k - 1, 0), k):
-            middle = (jnp.maximum(j - self.lowered, 0) + 0.5) * (self.chunk * self.substep)
+            middle = (jnp.maximum(j - int(self.lowered), 0).astype(way.length.dtype) + 0.5) * (self.chunk * self.substep)
             pose = pose_ahead(frame, jnp.minimum(middle, way.length))
             begins.append(self.block.corner(pose.x, pose.y))
         old, new = begins
@@ -127,8 +128,9 @@ class Advance(Step):
     def felt(self, way: Way, k: jax.Array, first: First, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The share of each cell that the blade covers at any time in step k, and the rate at which sand flows then."""
         along, across = self.block.coordinates(frame_of(self.block.shape, way.start), first)
-        begin = jnp.minimum(jnp.maximum(k - self.lowered, 0) * (self.chunk * self.substep), way.length)
-        ahead = jnp.where(k >= self.lowered, jnp.minimum(way.length - begin, self.chunk * self.substep), 0)
+        gone = jnp.maximum(k - int(self.lowered), 0).astype(way.length.dtype)
+        begin = jnp.minimum(gone * (self.chunk * self.substep), way.length)
+        ahead = jnp.where(k >= int(self.lowered), jnp.minimum(way.length - begin, self.chunk * self.substep), 0)
         beside = blade.share(across, -way.side, way.side)
         cover = inner(blade.straight(along - begin, beside, way.half, ahead).swept)
         return cover, way.rate * self.block.contact(way, view, cover, h)
@@ -142,8 +144,8 @@ class Advance(Step):
         pose, (along, across) = frame.pose, self.block.coordinates(frame, first)
         side = spread(way.side, across)
         beside = lax.optimization_barrier(blade.share(across, -side, side))
-        moving = k >= self.lowered
-        begin = jnp.where(moving, (k - self.lowered) * self.chunk + i, 0) * self.substep
+        moving = k >= int(self.lowered)
+        begin = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(way.length.dtype) * self.substep
         begin = jnp.minimum(begin, way.length)
         ahead = jnp.where(moving, jnp.minimum(way.length - begin, self.substep), 0)
         part = jnp.where(moving, ahead / self.substep, 1)

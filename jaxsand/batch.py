@@ -75,7 +75,7 @@ def _together(
         moving, sand, taken, ready = carry
         moving = jax.vmap(partial(march.body, march.params))(taken, moving)
         sand = jax.tree.map(lambda x, y: jnp.where(ready.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, moving[:2])
-        taken = taken + ~ready
+        taken = taken + (~ready).astype(taken.dtype)
         return moving, sand, taken, ready | jax.vmap(look)(taken, moving)
 
     sand = jax.vmap(enter)(height, lost)

@@ -109,8 +109,8 @@ class Block:
         size = self.near + 2
         like = jnp.zeros((size, size, *frame.pose.x.shape), frame.pose.x.dtype)
         pose = jax.tree.map(lambda x: spread(x, like), frame.pose)
-        x = numbers(size, 1, first[0]) + (first[0] + self.before - 0.5) - pose.x
-        y = numbers(size, 0, first[1]) + (first[1] + self.before - 0.5) - pose.y
+        x = numbers(size, 1, frame.pose.x) + (first[0].astype(like.dtype) + (self.before - 0.5)) - pose.x
+        y = numbers(size, 0, frame.pose.x) + (first[1].astype(like.dtype) + (self.before - 0.5)) - pose.y
         return x * pose.cos + y * pose.sin, y * pose.cos - x * pose.sin
 
     def part(self, x: jax.Array) -> jax.Array:

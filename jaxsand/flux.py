@@ -122,7 +122,7 @@ def worst_excess(bed: Bed, u: jax.Array, around: Nothing | Partial | None = None
         u, gate = halo(around.surface(at(u))), around.open
     worst = _highest(_excesses(bed, gate, u))
     if bed.rim is not None:
-        worst = jnp.maximum(worst, jnp.max(2 * _over(bed, bed.rim, at(u)) * (_draining_sides(bed.rim) > 0)))
+        worst = jnp.maximum(worst, jnp.max(jnp.where(_draining_sides(bed.rim) > 0, 2 * _over(bed, bed.rim, at(u)), 0)))
     return worst / bed.spacing
 
 

@@ -51,7 +51,7 @@ def frame_of(shape: tuple[int, int], pose: Pose) -> Frame:
 def numbers(count: int, axis: int, like: jax.Array) -> jax.Array:
     """0, 1, ... along an axis of a map, to be broadcast against what belongs to one map."""
     shape = (1, count) if axis else (count, 1)
-    return jnp.arange(count).reshape(*shape, *(1,) * like.ndim)
+    return jnp.arange(count, dtype=like.dtype).reshape(*shape, *(1,) * like.ndim)
 
 
 @jax.tree_util.register_dataclass

@@ -12,7 +12,7 @@ from jaxsand.bed import Lost, halo, largest, mark, nothing_lost, prepare, quantu
 from jaxsand.displace import Job
 from jaxsand.flux import worst_excess
 from jaxsand.grid import centres
-from jaxsand.rules import Outcome
+from jaxsand.rules import Outcome, said
 from jaxsand.scene import Scene
 from jaxsand.sweep import Flow
 from jaxsand.tool import NoTool, Pose, extent, local, lowest, reach
@@ -119,7 +119,7 @@ def corners(scene: Scene, job: Job, pose: Pose) -> tuple[jax.Array, jax.Array]:
 
 
 def _outcome(window_edge: jax.Array, not_finite: jax.Array) -> jax.Array:
-    return (Outcome.WINDOW_EDGE * window_edge + Outcome.NOT_FINITE * not_finite).astype(jnp.int32)
+    return said(Outcome.WINDOW_EDGE, window_edge) | said(Outcome.NOT_FINITE, not_finite)
 
 
 def _heading(start: jax.Array, stop: jax.Array, before: Pose | None) -> tuple[Pose, jax.Array]:

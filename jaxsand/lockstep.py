@@ -163,7 +163,7 @@ def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
     def advance(carry: Tree) -> Tree:
         state, k, count, ready = carry
         state = loop.keep(ready, state, loop.step(params, k, state))
-        k, count = k + 1, count + ~ready
+        k, count = k + 1, count + (~ready).astype(jnp.int32)
         return state, k, count, ready | loop.ready(params, k, state)
 
     zero = jnp.int32(0)
@@ -182,7 +182,7 @@ def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tr
         new, record = loop.step.recorded(params, k, state)
         tape = loop.put(tape, k % loop.room, record)
         state = loop.keep(ready, state, new)
-        k, count = k + 1, count + ~ready
+        k, count = k + 1, count + (~ready).astype(jnp.int32)
         return state, k, count, ready | loop.ready(params, k, state), tape
 
     def stretch(carry: Tree) -> Tree:

@@ -103,22 +103,25 @@ def _loop(loop: lockstep.Lanes, params: Tree, state: Tree) -> tuple[Tree, jax.Ar
 
 @_loop.defjvp
 def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
-    params, state = _first_order(primals)
+    params, state = first_order(primals)
     dparams, dstate = tangents
     dparams = tuple(d for d in jax.tree.leaves(dparams) if d.dtype != jax.dtypes.float0)
     end, count, tape, saved = lockstep.batched(lockstep.record, loop, params, state)
     none = None if count is None else np.zeros(count.shape, jax.dtypes.float0)
     if not jax.tree.leaves((dparams, dstate)):
         return (end, count), (dstate, none)
+    kept, shown = hidden((params, state, tape, saved))
     # One flat vector, so that vmap sees a single operand that is batched or not.
     start, unravel = ravel_pytree((dparams, dstate))
 
     def forward(_: Callable, vector: jax.Array) -> jax.Array:
         df, dx = unravel(vector)
+        params, state, *_ = shown(kept)
         return ravel_pytree((df, lockstep.batched(lockstep.push, loop, params, state, count, df, dx)))[0]
 
     def backward(_: Callable, vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
+        params, _, tape, saved = shown(kept)
         df, dx = lockstep.batched(lockstep.pull, loop, params, count, tape, saved, cx)
         return ravel_pytree((jax.tree.map(jnp.add, cf, df), dx))[0]
 
@@ -127,12 +130,31 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
     return (end, count), (out[1], none)
 
 
+def hidden(tree: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:
+    """The bits of a tree's floats as whole numbers, and how to get them back, which costs nothing within a program.
+
+    What a derivative keeps leaves the program that computes it, and `jax_debug_nans` would take the NaN of cells without
+    sand (bed.py) for a fault.
+    """
+    types = jax.tree.map(jnp.result_type, tree)
+
+    def bits(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+        inexact = jnp.issubdtype(dtype, jnp.inexact)
+        return lax.bitcast_convert_type(x, f"uint{8 * dtype.itemsize}") if inexact else x
+
+    def floats(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+        return lax.bitcast_convert_type(x, dtype) if jnp.issubdtype(dtype, jnp.inexact) else x
+
+    return jax.tree.map(bits, tree, types), lambda kept: jax.tree.map(floats, kept, types)
+
+
 @jax.custom_jvp
-def _first_order(tree: Tree) -> Tree:
+def first_order(tree: Tree) -> Tree:
+    """The same; what is differentiated through it cannot be differentiated again."""
     return tree
 
 
-@_first_order.defjvp
+@first_order.defjvp
 def _refuse(primals: Tree, tangents: Tree) -> Tree:
     raise NotImplementedError(
         "second derivatives through settling or pushing are not available; differentiate once, "

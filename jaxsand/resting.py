@@ -231,7 +231,8 @@ def _over(sand: Sand, rate: jax.Array, y: jax.Array, s: jax.Array) -> jax.Array:
     """What runs off over the rim, half a spacing beyond the outer cells."""
     assert sand.sides is not None
     assert sand.rim is not None
-    return truncate(jnp.maximum(y + rate * sand.open * sand.sides * (s - (sand.rim + sand.drop / 2)), 0) * (sand.sides > 0))
+    out = jnp.maximum(y + rate * sand.open * sand.sides * (s - (sand.rim + sand.drop / 2)), 0)
+    return truncate(jnp.where(sand.sides > 0, out, 0))
 
 
 def _gained(sand: Sand, flux: Fluxes) -> jax.Array:

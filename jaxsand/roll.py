@@ -58,7 +58,7 @@ def step_ahead(
 ) -> tuple[Pose, Pose, jax.Array, jax.Array]:
     """The poses before and after sub-step k of a leg, the way between (m), and which part of a whole sub-step that is."""
     whole = substep * job.bed.spacing
-    begin = k * whole
+    begin = k.astype(whole.dtype) * whole
     ahead = jnp.minimum(whole, length - begin)
     pose = Pose(start.x + begin * start.cos, start.y + begin * start.sin, start.cos, start.sin)
     return pose, Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin), ahead, ahead / whole
@@ -66,7 +66,7 @@ def step_ahead(
 
 def arrived(push: SteppedPush, params: Any, k: jax.Array, _: Any) -> jax.Array:
     _, job, _, length = params
-    return k * push.substep * job.bed.spacing >= length
+    return k.astype(length.dtype) * push.substep * job.bed.spacing >= length
 
 
 def _advance(push: SteppedPush, params: Any, k: jax.Array, state: State) -> State:

@@ -27,6 +27,11 @@ class Outcome(IntFlag):
     than the floats resolve. A bad cell of the map was treated as solid and given back as it was."""
 
 
+def said(outcome: Outcome, yes: jax.Array) -> jax.Array:
+    """The outcome's bit where there is something to say, 0 elsewhere (int32)."""
+    return jnp.where(yes, jnp.int32(outcome), jnp.int32(0))
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class UntilStill:

@@ -13,7 +13,7 @@ from jaxsand.bed import Bed, Lost, at, halo, largest, mark, nothing_lost, prepar
 from jaxsand.flux import Nothing, middle, steepest, worst_excess
 from jaxsand.levels import descend, start
 from jaxsand.march import March, Sand, march
-from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window
+from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
 from jaxsand.scene import Scene, cast, fit
 from jaxsand.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
 from jaxsand.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
@@ -92,9 +92,12 @@ def settle_batch(
 
 def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     """The tangent of the steepest slope between neighbours of a map [H, W]."""
-    scene, height = fit(scene, height)
-    marked, _ = mark(scene, height)
-    return steepest(prepare(scene), halo(marked))
+    return _steepest(*fit(scene, height))
+
+
+@jax.jit
+def _steepest(scene: Scene, height: jax.Array) -> jax.Array:
+    return steepest(prepare(scene), halo(mark(scene, height)[0]))
 
 
 def relax(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE) -> Settled:
@@ -117,10 +120,10 @@ def _judge(
     marked, broken = mark(scene, height)
     residual = worst_excess(bed, u)
     broken = broken | spoiled(marked, at(u)) | ~sound(bed)
-    still = Outcome.NOT_STILL * (residual > stop.tolerance)
-    outcome = still + Outcome.WINDOW_EDGE * touched + Outcome.NOT_FINITE * broken
+    still = said(Outcome.NOT_STILL, residual > stop.tolerance)
+    outcome = still | said(Outcome.WINDOW_EDGE, touched) | said(Outcome.NOT_FINITE, broken)
     settled = unmark(at(u), height)
-    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome.astype(jnp.int32), volume_lost(bed, lost))
+    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome, volume_lost(bed, lost))
 
 
 def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tuple[Sand, jax.Array]:

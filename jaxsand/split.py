@@ -80,7 +80,7 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
     put, kept = jnp.zeros_like(h), cut
     for way, amount in ((1, share * cut), (-1, (1 - share) * cut)):
         height = (amount * (dx**2 / thick) / mu * 2) @ hats
-        long = jnp.maximum(jnp.sqrt(jnp.where(height > 0, height, 1)) * (height > 0), dx / 2).reshape(h.shape)
+        long = jnp.maximum(jnp.where(height > 0, jnp.sqrt(jnp.where(height > 0, height, 1)), 0), dx / 2).reshape(h.shape)
         pile = wedge(way * n - (rim / 2 + flank), long, dx) * sand
         room = hats @ pile.ravel() * (dx / thick)
         placed = amount * jnp.minimum(room / ROOM, 1)

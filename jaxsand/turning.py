@@ -26,7 +26,7 @@ class Turn(Step):
     rest: Rest = bring_to_rest
 
     def turned(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
-        return jnp.all(k * self._part(way) >= jnp.abs(way.angle))
+        return jnp.all(k.astype(way.angle.dtype) * self._part(way) >= jnp.abs(way.angle))
 
     def _part(self, way: Way) -> jax.Array:
         far = jnp.minimum(jnp.hypot(way.half, way.side), math.hypot(*self.block.shape))
@@ -34,7 +34,7 @@ class Turn(Step):
 
     def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
         whole = self._part(way)
-        begin = k * whole
+        begin = k.astype(whole.dtype) * whole
         ahead = jnp.clip(jnp.abs(way.angle) - begin, 0, whole)
         part = ahead / whole
         sign = jnp.where(way.angle < 0, -1.0, 1.0).astype(begin.dtype)

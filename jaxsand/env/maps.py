@@ -57,7 +57,7 @@ class Walks:
         def one(k: jax.Array, carry: Any) -> Any:
             dig, place, heading = carry
             there = place[None] + STEPS
-            on = jnp.all((there >= 0) & (there < jnp.asarray(shape)[None]), axis=1)
+            on = jnp.all((there >= 0) & (there < jnp.asarray(shape, jnp.int32)[None]), axis=1)
             odds = jnp.where(on, jnp.log(jnp.roll(turns, heading)), -jnp.inf)
             heading = jax.random.categorical(jax.random.fold_in(walk, k), odds)
             place = there[heading]

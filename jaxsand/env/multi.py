@@ -115,6 +115,9 @@ class MultiStroke:
     simulator's "outcome"; a push that leaves no finite map leaves the map as it was.
 
     `push` is the full push or the fast one, `SwathPush()`; `settle` its stop rule, by default until still.
+
+    A reward is differentiable once, in forward and reverse mode, in the action, the state's maps and the scene's floats (not
+    where the map is the goal to the last bit, nor in the fifth number of a `Stop`), whatever the batching.
     """
 
     push: Push = field(default_factory=SteppedPush)
@@ -152,12 +155,16 @@ class MultiStroke:
 
     def stroke(self, action: jax.Array, params: StrokeParams) -> jax.Array:
         """The stroke x0, y0, x1, y1 (m) of an action [4] or longer."""
-        return (0.5 + (action[:4] + 1) / 2 * _cells(params)) * jnp.asarray(params.scene.grid.spacing, action.dtype)
+        cells, spacing = _cells(params).astype(action.dtype), jnp.asarray(params.scene.grid.spacing, action.dtype)
+        return (0.5 + (action[:4] + 1) / 2 * cells) * spacing
 
     def action(self, stroke: jax.typing.ArrayLike, params: StrokeParams) -> jax.Array:
         """The action of a stroke x0, y0, x1, y1 (m); with a `Stop`, one that goes on."""
-        steps = jnp.asarray(stroke) / params.scene.grid.spacing - 0.5
-        return jnp.concatenate([2 * steps / _cells(params) - 1, -jnp.ones(self.stop.size - 4, steps.dtype)])
+        stroke = jnp.asarray(stroke)
+        steps = stroke / jnp.asarray(params.scene.grid.spacing, stroke.dtype) - 0.5
+        return jnp.concatenate(
+            [2 * steps / _cells(params).astype(steps.dtype) - 1, -jnp.ones(self.stop.size - 4, steps.dtype)]
+        )
 
     def observe(self, state: StrokeState, params: StrokeParams) -> dict[str, jax.Array]:
         maps = {"goal": state.goal, "current": state.height}

@@ -95,4 +95,5 @@ class OnMap:
 def _only(shape: tuple[int, int], place: jax.Array) -> jax.Array:
     """The map on which one cell is true."""
     rows, columns = shape
-    return (jnp.arange(rows) == place[0])[:, None] & (jnp.arange(columns) == place[1])[None, :]
+    down, across = (jnp.arange(n, dtype=place.dtype) for n in (rows, columns))
+    return (down == place[0])[:, None] & (across == place[1])[None, :]

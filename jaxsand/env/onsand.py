@@ -94,15 +94,16 @@ class OnSand:
 
     def at(self, place: jax.Array, params: SandParams) -> jax.Array:
         """Where the centre of a map cell (row, column; row 0 on top) lies: x, y (m)."""
+        dx = jnp.float32(params.scene.grid.spacing)
         up = jnp.stack([place[1], self.shape[0] - 1 - place[0]])
-        return (self.layout.margin + (up + 0.5) * self.layout.cell) * params.scene.grid.spacing
+        return (self.layout.margin + (up.astype(jnp.float32) + 0.5) * self.layout.cell) * dx
 
     def observe(self, state: SandState, params: SandParams) -> dict[str, jax.Array]:
         blade, dx = blade_of(params.scene), jnp.float32(params.scene.grid.spacing)
         rows, columns = params.scene.grid.shape
         x, y = ((jnp.arange(n, dtype=jnp.float32) + 0.5) * dx for n in (columns, rows))
         here = self.at(state.walk.place, params)
-        pose = Pose(here[0], here[1], jnp.ones(()), jnp.zeros(()))
+        pose = Pose(here[0], here[1], jnp.ones_like(here[0]), jnp.zeros_like(here[0]))
         cover = coverage(blade, pose, jnp.broadcast_to(x[None], (rows, columns)), y[:, None], dx)
         maps = {"goal": self.goal(state.walk, params) / blade.depth, "current": state.height / blade.depth, "pose": cover}
         return {name: plane.astype(jnp.float32) for name, plane in maps.items()}

@@ -3,6 +3,10 @@
 A vmapped push takes as long as the longest of its strokes. `ByLength` therefore tells vmap to sort a batch by the strokes'
 lengths and to push chunk after chunk of like ones, each small enough for a core's cache. A map comes out as it would alone,
 up to rounding. On several cores of a CPU, give each a device of its own and a share of the batch (see the README).
+
+A rule for vmap has no derivative of its own. What follows is how a push gets one that is batched in the same way: tangents
+and cotangents are sorted and taken chunk after chunk like the maps. The derivative is that of the push alone, in both modes
+and once. Reverse mode keeps nothing of a push but what went into it and pushes each chunk again to pull back through it.
 """
 
 from collections.abc import Callable
@@ -12,12 +16,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jax.flatten_util import ravel_pytree
 
+from jaxsand.loop import first_order, split
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Stop, check_whole
-from jaxsand.scene import Scene
+from jaxsand.scene import Scene, cast
 from jaxsand.sim import step
 from jaxsand.swath import SwathPush
 
@@ -28,7 +35,7 @@ Pushing = Callable[[Scene, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 @dataclass(frozen=True)
 class Together:
-    """A batch is pushed all at once, as long as its longest stroke takes (neutral): what suits a GPU, and derivatives."""
+    """A batch is pushed all at once, as long as its longest stroke takes (neutral): what suits a GPU."""
 
     def pushing(self, push: Push, stop: Stop | None) -> Pushing:
         return _alone(push, stop)
@@ -36,7 +43,7 @@ class Together:
 
 @dataclass(frozen=True)
 class ByLength:
-    """A batch is pushed in chunks of maps with strokes of like length: what suits a CPU. Has no reverse mode."""
+    """A batch is pushed in chunks of maps with strokes of like length: what suits a CPU."""
 
     chunk: int = 32
 
@@ -44,7 +51,7 @@ class ByLength:
         check_whole("chunk", self.chunk, 1)
 
     def pushing(self, push: Push, stop: Stop | None) -> Pushing:
-        return sorted_by_length(self, _alone(push, stop))
+        return by_length(self, _alone(push, stop))
 
 
 Batching = Together | ByLength
@@ -60,8 +67,63 @@ def _alone(push: Push, stop: Stop | None) -> Pushing:
 
 
 @cache
-def sorted_by_length(way: ByLength, alone: Pushing) -> Pushing:
-    """A push that vmap batches that way."""
+def by_length(way: ByLength, alone: Pushing) -> Pushing:
+    """A push that vmap batches that way, and so its derivatives; they are those of the push alone."""
+
+    def of_floats(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[Callable, Any]:
+        """The map that is left as a function of all floats, and these."""
+        floats, merge = split((scene, stroke))
+
+        def left(floats: Any, before: jax.Array) -> jax.Array:
+            scene, stroke = merge(floats)
+            return alone(scene, before, stroke)[0]
+
+        return left, (floats, before)
+
+    def tangent(scene: Scene, before: jax.Array, stroke: jax.Array, *tangents: Any) -> jax.Array:
+        return jax.jvp(*of_floats(scene, before, stroke), tangents)[1]
+
+    def cotangent(scene: Scene, before: jax.Array, stroke: jax.Array, gain: jax.Array) -> tuple[Any, jax.Array]:
+        left, at = of_floats(scene, before, stroke)
+        return jax.vjp(left, *at)[1](gain)
+
+    many, forwards, backwards = (sorted_by_length(way, f) for f in (alone, tangent, cotangent))
+
+    @jax.custom_jvp
+    def pushed(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return many(scene, before, stroke)
+
+    @pushed.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        primals = first_order(primals)
+        dscene, dbefore, dstroke = tangents
+        dfloats = tuple(d for d in jax.tree.leaves((dscene, dstroke)) if d.dtype != jax.dtypes.float0)
+        start, unravel = ravel_pytree((dfloats, dbefore))
+
+        def solve(_: Callable, vector: jax.Array) -> jax.Array:
+            dfloats, dbefore = unravel(vector)
+            return ravel_pytree((dfloats, forwards(*primals, dfloats, dbefore)))[0]
+
+        def transpose(_: Callable, vector: jax.Array) -> jax.Array:
+            to_floats, gain = unravel(vector)
+            more, to_before = backwards(*primals, gain)
+            return ravel_pytree((jax.tree.map(jnp.add, to_floats, more), to_before))[0]
+
+        # As in loop.py: the solution of "identity times x = start" by rules of our own.
+        dheight = unravel(lax.custom_linear_solve(lambda v: v, start, solve, transpose))[1]
+        after, outcome = many(*primals)
+        return (after, outcome), (dheight, np.zeros(outcome.shape, jax.dtypes.float0))
+
+    def cast_first(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[jax.Array, jax.Array]:
+        before = jnp.asarray(before)
+        return pushed(cast(scene, before.dtype), before, jnp.asarray(stroke, before.dtype))
+
+    return cast_first
+
+
+@cache
+def sorted_by_length(way: ByLength, alone: Callable) -> Callable:
+    """A function of a scene, a map, a stroke and more that vmap batches that way; without derivatives."""
     one = custom_vmap(alone)
 
     @one.def_vmap
@@ -75,12 +137,13 @@ def sorted_by_length(way: ByLength, alone: Pushing) -> Pushing:
         chunks = -(-size // chunk)
         filled = jnp.concatenate([order, jnp.repeat(order[-1:], chunk * chunks - size)]).reshape(chunks, chunk)
 
-        def pushed(who: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def pushed(who: jax.Array) -> Any:
             some = [jnp.asarray(leaf)[who] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)]
             axes = jax.tree.unflatten(tree, [0 if m else None for m in mapped])
             return jax.vmap(alone, in_axes=axes)(*jax.tree.unflatten(tree, some))
 
         out = jax.tree.map(lambda x: x.reshape(chunks * chunk, *x.shape[2:])[:size], lax.map(pushed, filled))
-        return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x, unique_indices=True), out), (True, True)
+        out = jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x, unique_indices=True), out)
+        return out, jax.tree.map(lambda _: True, out)
 
     return one
