@@ -66,7 +66,8 @@ _HOMES = {
     "settle_batch": "settling",
     "steepest_slope": "settling",
     "step": "sim",
-    "step_batch": "sim",
+    "step_batch": "pusher",
+    "value_and_grad_batch": "pusher",
     "volume": "scene",
 }
 __all__ = [*_HOMES]

@@ -88,10 +88,7 @@ def _together(
 def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int | None) -> Tree:
     """`run(others, batch, chunk=...)` on every core: the batch [B, ...] is cut into as many parts, of chunks of one size."""
     leaves = jax.tree.leaves(batch)
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((batch, others))):
-        raise ValueError(
-            "settle_batch and step_batch are outermost programs: inside jit, grad or vmap use jax.vmap of settle or step"
-        )
+    _refuse_tracers(jax.tree.leaves((batch, others)))
     total = leaves[0].shape[0]
     if chunk is None:
         chunk = max(1, _CELLS // math.prod(leaves[0].shape[1:])) if _on_cpu() else total
@@ -119,6 +116,49 @@ def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int
     return jax.tree.map(lambda x: x[:total], out) if extra else out
 
 
+SIZES = (8, 16, 32, 64)
+"""Of groups, on a CPU: a few, so that few programs are compiled."""
+
+
+def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], np.ndarray], chunk: int | None) -> Tree:
+    """`run` on groups of a batch [B, ...] of like cost, the dearest first; each core takes the next. The last group is
+    filled up by copies."""
+    leaves = jax.tree.leaves(batch)
+    _refuse_tracers(leaves)
+    total = leaves[0].shape[0]
+    size = group_size(total, chunk)
+    order = np.argsort(-np.nan_to_num(cost(batch), posinf=0, neginf=0), kind="stable")
+    extra = -total % size
+    filled = np.concatenate([order, np.repeat(order[-1:], extra)]).reshape(-1, size)
+    x64 = jnp.result_type(float) == jnp.float64  # which may hold for this thread alone
+
+    def part(who: np.ndarray) -> Tree:
+        with jax.enable_x64(x64):
+            return jax.block_until_ready(run(jax.tree.map(lambda x: x[who], batch)))
+
+    with ThreadPoolExecutor(min(cores(), len(filled))) as pool:
+        outs = list(pool.map(part, filled))
+    back = np.argsort(order)
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *outs)
+
+
+def group_size(total: int, chunk: int | None) -> int:
+    """How many maps of a batch to push together."""
+    if chunk is not None:
+        return min(chunk, next((size for size in SIZES if size >= total), chunk))
+    if not _on_cpu():
+        return 1 << max(0, total - 1).bit_length()
+    return next((size for size in SIZES if size * cores() >= total), SIZES[-1])
+
+
+def _refuse_tracers(leaves: list) -> None:
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        raise ValueError(
+            "settle_batch, step_batch and their like are outermost programs: inside jit, grad or vmap use jax.vmap of "
+            "settle or step"
+        )
+
+
 def in_turns(runs: Sequence[Callable[[Any], Tree]], flagged: Callable[[Tree], jax.Array]) -> Tree:
     """The batch of the first run, `runs[0](which)`; what is flagged in it comes from the second, and so on."""
     out = runs[0](slice(None))
@@ -126,10 +166,7 @@ def in_turns(runs: Sequence[Callable[[Any], Tree]], flagged: Callable[[Tree], ja
         left = np.flatnonzero(flagged(out))
         if not left.size:
             break
-        # Batches of a few sizes, so that few programs are compiled.
-        size = 8 ** math.ceil(math.log(max(left.size, 8), 8))
-        again = run(np.resize(left, min(size, jax.tree.leaves(out)[0].shape[0])))
-        out = jax.tree.map(lambda x, y, left=left: x.at[left].set(y[: left.size]), out, again)
+        out = jax.tree.map(lambda x, y, left=left: x.at[left].set(y), out, run(left))
     return out
 
 

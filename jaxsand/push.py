@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxsand.advance import Advance, Rest
 from jaxsand.block import Block, Moving, Way
@@ -90,6 +91,9 @@ def _leg(
         near = min(size, scene.window.near or size)
     block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, drains)
     h, lost, moved = state
+    if near < size:  # a traced blade that is larger than the one for which the window was made
+        far = lax.stop_gradient(_far(job.tool.width / dx, job.tool.thickness / dx))
+        moved = jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, moved)
     none = no_flux(block.neighbours, drains, jnp.zeros((size, size), h.dtype))
     flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
     sand = Moving(flat, gone, none, moved)
@@ -144,11 +148,16 @@ def with_near(scene: Scene) -> Scene:
     if any(x is None or x.ndim for x in parts):
         return scene
     width, thickness, dx = (float(x) for x in parts if x is not None)
-    # Covers are smoothed over a spacing; a block stays where it is while the blade moves by one; sand is handed on by one.
-    far = math.hypot(width / dx + 1, thickness / dx + 1) / 2 + 0.5
+    far = _far(width / dx, thickness / dx)
     if not far < max(scene.grid.shape):
         return scene
-    return replace(scene, window=replace(scene.window, near=2 * math.floor(far + 0.5) + 3))
+    return replace(scene, window=replace(scene.window, near=2 * math.floor(far) + 3))
+
+
+def _far(width: Any, thickness: Any) -> Any:
+    """How far from a block's middle, in cells, a blade can cover one: covers are smoothed over a spacing, and a block stays
+    where it is while the blade moves by one."""
+    return ((width + 1) ** 2 + (thickness + 1) ** 2) ** 0.5 / 2 + 1
 
 
 def windows_for(scene: Scene, push: Any, least: float) -> Iterator[Scene]:

@@ -22,10 +22,11 @@ from jaxsand.bed import truncate
 from jaxsand.flux import Fluxes
 from jaxsand.grid import links
 from jaxsand.push import SteppedPush, push_along
+from jaxsand.pusher import step_batch
 from jaxsand.resting import Sand, no_flux
 from jaxsand.scene import Scene, cast, fit, make_scene
 from jaxsand.settling import settle, settle_batch
-from jaxsand.sim import follow_frames, step, step_batch
+from jaxsand.sim import follow_frames, step
 from jaxsand.stencil import net, steps
 from jaxsand.swath import SwathPush
 from jaxsand.tool import Blade

@@ -1,25 +1,22 @@
 """The simulator: a tool acts, the sand settles."""
 
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.batch import in_turns, on_all_cores, wide_vectors
 from jaxsand.legs import Pushed
 from jaxsand.push import SteppedPush, push_along, windows_for, with_near
 from jaxsand.roll import roll_along
-from jaxsand.rules import Outcome, Stop, as_batch, check_chunk, check_rate, check_rule, check_whole
+from jaxsand.rules import Outcome, Stop, check_rate, check_rule, check_whole
 from jaxsand.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.schemes import Scheme
-from jaxsand.settling import Settled, relax, relax_batch
+from jaxsand.settling import Settled, relax
 from jaxsand.split import SplitPush, push_split
 from jaxsand.swath import SwathPush, push_swath
 from jaxsand.tool import Blade, NoTool, Pose, Wheel
-from jaxsand.window import Whole
 
 Push = SteppedPush | SwathPush | SplitPush
 _PUSHES: dict[tuple[type, type], Any] = {
@@ -46,7 +43,7 @@ def act(scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike
 
     The map is not settled afterwards; see `step`.
     """
-    scene, height, rules = _ready(scene, height, push, None, None)
+    scene, height, rules = ready(scene, height, push, None, None)
     return _act(scene, height, _stroke(stroke, height.dtype), rules)
 
 
@@ -95,7 +92,7 @@ def follow(
     On a map much wider than the blade's heap only a window around the blade is computed, as wide as the sand asks for (not
     inside `jit`, `grad` or `vmap`, where the scene's own window holds).
     """
-    scene, height, rules = _ready(scene, height, push, scheme, stop)
+    scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
     if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, height, path, rules))):
         for part in windows_for(scene, rules[0], 4):
@@ -115,7 +112,7 @@ def follow_frames(
     stop: Stop | None = None,
 ) -> tuple[Shaped, jax.Array]:
     """`follow`, and the map after each leg, before the tool is lifted: [n - 1, H, W] (m)."""
-    scene, height, rules = _ready(scene, height, push, scheme, stop)
+    scene, height, rules = ready(scene, height, push, scheme, stop)
     return _follow(scene, height, _path(path, height.dtype), rules, record=_itself)
 
 
@@ -129,39 +126,11 @@ def rollout(
     stop: Stop | None = None,
 ) -> Shaped:
     """Pushes one after the other: `strokes` [n, 4] (m). Every field of the result gains a leading axis of length n."""
-    scene, height, rules = _ready(scene, height, push, scheme, stop)
+    scene, height, rules = ready(scene, height, push, scheme, stop)
     strokes = as_array("strokes", strokes, height.dtype)
     if strokes.ndim != 2 or strokes.shape[1] != 4:
         raise ValueError(f"strokes: got shape {list(strokes.shape)}; give [n, 4], a row x0, y0, x1, y1 for each push")
     return _rollout(scene, height, strokes, rules)
-
-
-def step_batch(
-    scene: Scene,
-    height: jax.typing.ArrayLike,
-    stroke: jax.typing.ArrayLike,
-    *,
-    push: Push | None = None,
-    scheme: Scheme | None = None,
-    stop: Stop | None = None,
-    chunk: int | None = None,
-) -> Shaped:
-    """`step` on a batch of maps [B, H, W] and strokes [B, 4] of one scene; every field of the result gains the batch axis.
-
-    Like `settle_batch`, it takes the maps in chunks and is an outermost program.
-    """
-    height = as_batch(height)
-    stroke = as_array("stroke", stroke, height.dtype)
-    if stroke.shape != (height.shape[0], 4):
-        raise ValueError(f"stroke: got shape {list(stroke.shape)}; give [{height.shape[0]}, 4], one stroke for each map")
-    check_chunk(chunk)
-    scene, _, rules = _ready(scene, height[0], push, scheme, stop)
-
-    def run(scene: Scene, who: np.ndarray | slice) -> Shaped:
-        return on_all_cores(_step_program(), (scene, rules), (height[who], stroke[who].reshape(-1, 2, 2)), chunk)
-
-    scenes = [*windows_for(scene, rules[0], 1.5), scene]
-    return in_turns([partial(run, one) for one in scenes], lambda out: out.outcome & Outcome.WINDOW_EDGE)
 
 
 class OutcomeError(RuntimeError):
@@ -201,10 +170,10 @@ def check(result: Settled | Pushed) -> None:
     raise OutcomeError(where + "; ".join(advice.format(**detail) for bit, advice in _ADVICE.items() if bit in code))
 
 
-_Rules = tuple[Push, Scheme, Stop]
+Rules = tuple[Push, Scheme, Stop]
 
 
-def _way(scene: Scene, push: Push) -> Any:
+def way_of(scene: Scene, push: Push) -> Any:
     """How the push moves the scene's tool."""
     return _PUSHES[type(scene.tool), type(push)]
 
@@ -215,7 +184,7 @@ def check_push(push: Any) -> None:
         raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
 
 
-def _ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, _Rules]:
+def ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, Rules]:
     push = SteppedPush() if push is None else push
     check_push(push)
     if (type(scene.tool), type(push)) not in _PUSHES:
@@ -254,43 +223,26 @@ def _itself(height: jax.Array) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames="record")
-def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules, record: Any = None) -> tuple[Shaped, Any]:
+def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: Rules, record: Any = None) -> tuple[Shaped, Any]:
     push, scheme, stop = rules
-    pushed, frames = _way(scene, push)(scene, height, path, push, record)
-    return _both(pushed, relax(scene, pushed.height, scheme, stop)), frames
+    pushed, frames = way_of(scene, push)(scene, height, path, push, record)
+    return lifted(pushed, relax(scene, pushed.height, scheme, stop)), frames
 
 
-def _both(pushed: Pushed, settled: Settled) -> Shaped:
+def lifted(pushed: Pushed, settled: Settled) -> Shaped:
     outcome, drained = settled.outcome | pushed.outcome, settled.drained + pushed.drained
     return Shaped(**vars(replace(settled, outcome=outcome, drained=drained)), pose=pushed.pose)
 
 
 @jax.jit
-def _act(scene: Scene, height: jax.Array, path: jax.Array, rules: _Rules) -> Pushed:
-    return _way(scene, rules[0])(scene, height, path, rules[0])[0]
+def _act(scene: Scene, height: jax.Array, path: jax.Array, rules: Rules) -> Pushed:
+    return way_of(scene, rules[0])(scene, height, path, rules[0])[0]
 
 
 @jax.jit
-def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: _Rules) -> Shaped:
+def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: Rules) -> Shaped:
     def one(height: jax.Array, stroke: jax.Array) -> tuple[jax.Array, Shaped]:
         shaped, _ = _follow(scene, height, stroke.reshape(2, 2), rules)
         return shaped.height, shaped
 
     return jax.lax.scan(one, height, strokes)[1]
-
-
-def _step_chunks(fixed: tuple[Scene, _Rules], maps_and_paths: tuple[jax.Array, jax.Array], *, chunk: int) -> Shaped:
-    scene, (push, scheme, stop) = fixed
-    act_on = partial(_way(scene, push), scene, push=push)
-    # Strokes of like length together: a chunk takes as long as its longest one.
-    run = maps_and_paths[1][:, 1] - maps_and_paths[1][:, 0]
-    order = jnp.argsort(jnp.hypot(run[:, 0], run[:, 1]))
-    some = jax.tree.map(lambda x: x[order], maps_and_paths)
-    pushed = jax.lax.map(lambda pair: act_on(*pair)[0], some, batch_size=chunk)
-    pushed = jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x, unique_indices=True), pushed)
-    return _both(pushed, relax_batch((scene, scheme, stop, Whole()), pushed.height, chunk=chunk))
-
-
-@cache
-def _step_program() -> Any:
-    return jax.jit(_step_chunks, static_argnames="chunk", compiler_options=wide_vectors())

@@ -30,6 +30,7 @@ FLOORS = [
     {"push", "swath", "trench"},
     {"roll", "split"},
     {"sim"},
+    {"pusher"},
     {"task", "goals", "planner", "plain", "scans", "calibration", "sections", "strokenet"},
     {"strokeloss", "success", "policy"},
     {"sandplan", "optimise", "lookahead"},

@@ -24,7 +24,7 @@ from jaxsand.env.onmap import MapParams, MapState, OnMap
 from jaxsand.env.onsand import OnSand, SandParams, SandState
 from jaxsand.env.pushing import ByLength, Together
 from jaxsand.env.spaces import Box, Dict, Discrete
-from jaxsand.push import SteppedPush
+from jaxsand.push import SteppedPush, with_near
 from jaxsand.rules import check_whole
 from jaxsand.scene import Scene, make_scene
 from jaxsand.tool import Blade
@@ -128,6 +128,7 @@ def _multi(
         window = Window(_WINDOW) if isinstance(env.push, SteppedPush) else Whole()
         scene = make_scene(_SHAPE, _SPACING, tool=Blade(), window=window)
     check_scene(scene)
+    scene = with_near(scene)
     if isinstance(goals, LevelGoals | RoughGoals):
         check_ready_goals(scene, goals, starts)
     else:

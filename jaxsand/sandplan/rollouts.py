@@ -1,30 +1,20 @@
-"""The children of a search on real sand, evaluated by rolling out the simulator, many at once.
+"""The children of a search on real sand, evaluated by rolling out the simulator, many at once."""
 
-Batches are filled up to a few fixed sizes, so that a scene compiles a few programs and no more.
-"""
-
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.batch import cores, on_all_cores, wide_vectors
+from jaxsand.pusher import act_batch, step_batch
 from jaxsand.rules import Sweeps
 from jaxsand.sandplan.actions import Path
 from jaxsand.scene import Scene
 from jaxsand.settling import settle_batch
-from jaxsand.sim import act, check, follow, step_batch
+from jaxsand.sim import check, follow
 from jaxsand.swath import SwathPush
 
 CHEAP = 1 / 12
 """What a rough push counts for, in full ones; `jaxsand bench sand` measures it."""
-
-_SIZES = (8, 32, 256)
-_CHUNK = 16
 
 
 @dataclass(frozen=True)
@@ -56,7 +46,7 @@ def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     Raises:
       OutcomeError: if none of a batch is clean.
     """
-    return _in_batches(partial(_push, scene), maps, strokes)[0]
+    return _clean(step_batch(scene, *_single(maps, strokes)))
 
 
 def replay(scene: Scene, height: np.ndarray, paths: list[Path] | tuple[Path, ...]) -> np.ndarray:
@@ -71,7 +61,7 @@ def replay(scene: Scene, height: np.ndarray, paths: list[Path] | tuple[Path, ...
 
 def roughly_pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     """`pushed` in closed form and with 8 sweeps of settling: to rank by, not to judge by."""
-    return _in_batches(partial(_push_roughly, scene), maps, strokes)[0]
+    return np.asarray(step_batch(scene, *_single(maps, strokes), push=SwathPush(), stop=Sweeps(8)).height)
 
 
 def walked(scene: Scene, maps: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,8 +69,8 @@ def walked(scene: Scene, maps: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray
 
     The tool comes down again at the start of a leg, where it had stood; `follow` of the whole path settles a little less.
     """
-    down, settled = _in_batches(partial(_walk, scene), maps, legs)
-    return down, settled
+    down = act_batch(scene, *_single(maps, legs)).height
+    return np.asarray(down), _clean(settle_batch(scene, down))
 
 
 def distinct(marks: list[bytes], parent: np.ndarray, order: np.ndarray, count: int, most: int) -> list[int]:
@@ -104,33 +94,6 @@ def marks(maps: np.ndarray, grain: float) -> list[bytes]:
     return [one.tobytes() for one in rounded]
 
 
-def _in_batches(run: Callable, maps: np.ndarray, strokes: np.ndarray) -> list[np.ndarray]:
-    """Shorter strokes first, since a chunk takes as long as its longest one."""
-    order = np.argsort(np.hypot(*(strokes[:, 2:] - strokes[:, :2]).T), kind="stable")
-    parts = []
-    for begin in range(0, len(order), _SIZES[-1]):
-        some = order[begin : begin + _SIZES[-1]]
-        size = next(size for size in _SIZES if size >= len(some))
-        filled = np.concatenate([some, np.repeat(some[-1:], size - len(some))])
-        chunk = min(max(1, size // cores()), _CHUNK)
-        outs = run(maps[filled].astype(np.float32), strokes[filled].astype(np.float32), chunk)
-        parts.append([np.asarray(out)[: len(some)] for out in outs])
-    return [np.concatenate(column)[np.argsort(order)] for column in zip(*parts, strict=True)]
-
-
-def _push(scene: Scene, maps: np.ndarray, strokes: np.ndarray, chunk: int) -> tuple[np.ndarray]:
-    return (_clean(step_batch(scene, maps, strokes, chunk=chunk)),)
-
-
-def _push_roughly(scene: Scene, maps: np.ndarray, strokes: np.ndarray, chunk: int) -> tuple[jax.Array]:
-    return (step_batch(scene, maps, strokes, push=SwathPush(), stop=Sweeps(8), chunk=chunk).height,)
-
-
-def _walk(scene: Scene, maps: np.ndarray, legs: np.ndarray, chunk: int) -> tuple[Any, np.ndarray]:
-    down = on_all_cores(_act_program(), scene, (jnp.asarray(maps), jnp.asarray(legs)), chunk)
-    return down, _clean(settle_batch(scene, down))
-
-
 def _clean(result: Any) -> np.ndarray:
     good = np.asarray(result.outcome) == 0
     if not good.any():
@@ -138,9 +101,5 @@ def _clean(result: Any) -> np.ndarray:
     return np.where(good[:, None, None], np.asarray(result.height), np.nan)
 
 
-@cache
-def _act_program() -> Any:
-    def run(scene: Scene, batch: tuple[jax.Array, jax.Array], *, chunk: int) -> jax.Array:
-        return jax.lax.map(lambda pair: act(scene, *pair).height, batch, batch_size=chunk)
-
-    return jax.jit(run, static_argnames="chunk", compiler_options=wide_vectors())
+def _single(maps: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(maps, np.float32), np.asarray(strokes, np.float32)
