@@ -137,7 +137,7 @@ def _leg(
     return h, lost, sand.edge
 
 
-_SPARE = 3  # cells: the margin in which sand must not move, and how far the tool moves in its window
+_SPARE = 2  # cells: the margin in which sand must not move
 
 
 def with_near(scene: Scene) -> Scene:
