@@ -76,7 +76,7 @@ def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
         path = 0.16 + hair * np.concatenate([np.zeros((1, 2)), np.cumsum(np.c_[np.cos(headings), np.sin(headings)], 0)])
         maps.append(np.asarray(js.follow(sand, np.zeros((32, 32)), path).height))
     for h in maps[1:]:
-        assert np.abs(h - maps[0]).sum() < 0.03 * np.abs(maps[0]).sum()
+        assert np.abs(h - maps[0]).sum() < 0.02 * np.abs(maps[0]).sum()
     x, y = np.meshgrid(np.arange(32) + 0.5 - 16, np.arange(32) + 0.5 - 16)
     disc = maps[0][np.hypot(x, y) < 2]
     assert disc.mean() < -0.8 * 0.0075  # it dug where it swept
@@ -91,6 +91,26 @@ def test_nothing_drains_over_a_rim_above_the_sand():
         drained[rim] = float(out.drained)
     assert drained[10.0] == 0
     assert 0 < drained[0.0] < drained[-0.02]
+
+
+@pytest.mark.parametrize("short", [0.05, -0.05])
+def test_what_drains_from_a_channel_is_its_arithmetic(short):
+    """A blade that fills the channel stops `short` of the edge: what does not fit between, at repose from the edge, drains.
+
+    The default push is up to 10% off: sand that it lets run off too early does not come back.
+    """
+    dx, width, depth, thickness, way = 0.005, 0.015, 0.012, 0.02, 0.15
+    columns = 64
+    solid = np.zeros((5, columns), bool)
+    solid[[0, -1]] = True
+    blade = js.Blade(5 * dx, thickness, depth)
+    sand = js.make_scene((5, columns), dx, ANGLE, tool=blade, walls=js.Walls(solid), edge=js.Draining(0.0))
+    face = columns * dx - short - thickness / 2
+    stroke = [face - way, 2.5 * dx, face, 2.5 * dx]
+    heap = depth * (way + thickness / 2 + min(short, 0)) - math.tan(ANGLE) * max(short, 0) ** 2 / 2
+    for push, off in ((js.SteppedPush(), 0.1), (js.SteppedPush(1 / 8, 32), 0.01)):
+        out = js.act(sand, np.zeros((5, columns)), stroke, push=push)
+        assert float(out.drained) == pytest.approx(width * heap, rel=off)
 
 
 def test_large_maps_are_computed_where_sand_moves():
