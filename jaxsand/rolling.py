@@ -148,7 +148,7 @@ class Roll(_Moved):
             part = jnp.where(still, 1, ahead / self.substep)
             flux = moved_on(flux, ahead * frame.pose.cos, ahead * frame.pose.sin)
             flux = tuple(jnp.where(still, 0, f) for f in flux)
-            shares = wheel.leaving(track, frame, view, now)
+            shares = wheel.leaving(track, frame, now)
             h, flux, more = self.moved(track, view, shares, now, part, h, flux, left)
             return h, flux, gone if gone is None or more is None else gone + more
 

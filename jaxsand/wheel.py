@@ -2,9 +2,9 @@
 
 A wheel is a rim over each cell, at a height b of its own (tool.py), with room below where it hangs above the sand. Where it
 covers the share a of a cell, the cell's sand above b lies in the open share 1 - a. What comes to lie above the rim as the
-wheel moves leaves it, off the rim or off the flank that leads, along that face's normal, turned towards the wheel's way by
-the angle of repose at most, which is the friction of a rough face. Sand under the wheel is handed on, cell by cell, until
-there is room beside it or below the rim. Grousers take some of what the rim displaces to behind the wheel.
+wheel moves leaves it along the normal of the face that displaces it, the rim or the flank that leads; off the rim also
+towards the nearer flank. Sand under the wheel is handed on, cell by cell, until there is room beside it or below the rim.
+Grousers take some of what is displaced to behind the wheel.
 
 The wheel is a wall as far as sand touches it. Sand that lies lower than the rim is as free as if there were no wheel; within
 a quarter of a spacing below it the wheel begins to be felt. The planes through the axle and across it, as wide as the wheel,
@@ -28,6 +28,7 @@ from jaxsand.stencil import both_ends, inner, outer, spread
 
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it
 _PASSES = 4  # how many cells sand under the wheel moves on in a sub-step
+_ASIDE = 0.5  # how far to its side sand leaves the rim at its edges, to a unit ahead
 _LEAST = 1e-4
 
 
@@ -91,51 +92,48 @@ def cleared(old: Stand, new: Stand, h: jax.Array) -> jax.Array:
     return truncate(new.cover * below + jnp.maximum(part, inside) * above)
 
 
-def leaving(track: Track, frame: Frame, view: View, wheel: Stand) -> blade.Shares:
-    """The shares for the directions in which sand leaves the rim and, within two spacings of it, the leading flank."""
-    way, pose, slip = track.way, frame.pose, track.seen(frame)
-    side = jnp.sign(slip)
-    friction = jnp.arctan(view.drop * way.quantum / way.spacing)
-    steep = jnp.pi / 2 - jnp.abs(slip)  # a face that hardly leads hardly turns sand
-    off_rim = -side * jnp.maximum(jnp.abs(slip) - friction, 0) * jnp.clip(steep / friction, 0, 1)
-    off_flank = side * jnp.maximum(steep - friction, 0) * jnp.minimum(jnp.abs(slip) / friction, 1)
-    leads = jnp.clip(wheel.aside * side - way.side + 2.5, 0, 1)
-    turn = off_rim + leads * (off_flank - off_rim)
-    p = pose.cos * jnp.cos(turn) - pose.sin * jnp.sin(turn)
-    q = pose.sin * jnp.cos(turn) + pose.cos * jnp.sin(turn)
-    return _straight(p, q)
+def leaving(track: Track, frame: Frame, wheel: Stand) -> blade.Shares:
+    """The shares for the directions in which sand leaves the rim and, within two spacings of it, the leading flank.
+
+    In the wheel's plane and along its axle, u from -1 at one flank to 1 at the other, beta the slip angle: off the rim
+    (1, u / 2), off the flank (0, 1); where a face hardly leads, below 30 degrees of the wheel's way, turned to that.
+    """
+    slip = track.seen(frame)
+    cos, sin = jnp.cos(slip), jnp.sin(slip)
+    hardly = [1 - jnp.clip(2 * x, 0, 1) for x in (cos, jnp.abs(sin))]
+    leads = jnp.clip(wheel.aside * jnp.sign(slip) - track.way.side + 2.5, 0, 1)
+    aside = jnp.clip(wheel.aside / track.way.side, -1, 1) * (_ASIDE * cos) + sin * hardly[0]
+    a, c = cos + leads * (cos * hardly[1] - cos), aside + leads * (sin - aside)
+    p, q = _on_the_map(track, frame, a, c)
+    most = jnp.maximum(jnp.maximum(jnp.abs(p), jnp.abs(q)), _LEAST)
+    return blade.any_way(p / most, q / most)
 
 
 def turning(track: Track, frame: Frame, wheel: Stand, way: jax.Array) -> blade.Shares:
     """The shares for a turn in place, counter-clockwise where `way` is 1: along the axle, to where the wheel moves."""
-    slip = track.seen(frame)
     forward = jnp.clip(wheel.along, -1, 1) * way
-    p = forward * (frame.pose.cos * jnp.sin(slip) - frame.pose.sin * jnp.cos(slip))
-    q = forward * (frame.pose.sin * jnp.sin(slip) + frame.pose.cos * jnp.cos(slip))
-    size = jnp.maximum(jnp.maximum(jnp.abs(p), jnp.abs(q)), 1)
+    p, q = _on_the_map(track, frame, jnp.zeros_like(forward), forward)
+    size = jnp.maximum(jnp.maximum(jnp.abs(p), jnp.abs(q)), jnp.abs(forward))
+    size = jnp.where(size > 0, size, 1)
     return blade.any_way(p / size, q / size)
 
 
 def radial(track: Track, frame: Frame, wheel: Stand) -> blade.Shares:
     """The shares for directions away from the wheel's centre, in the proportions of its chord and width; shorter within a
     cell of that."""
-    slip = track.seen(frame)
-    along, across = wheel.along / (4 * track.way.half**2), wheel.aside / (4 * track.way.side**2)
-
-    def turned(a: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
-        s, n = a * jnp.cos(slip) + c * jnp.sin(slip), c * jnp.cos(slip) - a * jnp.sin(slip)
-        return s * frame.pose.cos - n * frame.pose.sin, s * frame.pose.sin + n * frame.pose.cos
-
-    (p, q), (x, y) = turned(along, across), turned(wheel.along, wheel.aside)
+    along, across = wheel.along / track.way.half**2, wheel.aside / track.way.side**2
+    (p, q), (x, y) = _on_the_map(track, frame, along, across), _on_the_map(track, frame, wheel.along, wheel.aside)
     size = jnp.maximum(jnp.abs(p), jnp.abs(q))
     scale = jnp.minimum(jnp.maximum(jnp.abs(x), jnp.abs(y)), 1) / jnp.where(size > 0, size, 1)
     scale = jnp.where(size > 0, scale, 0)
     return blade.any_way(p * scale, q * scale)
 
 
-def _straight(p: jax.Array, q: jax.Array) -> blade.Shares:
-    most = jnp.maximum(jnp.abs(p), jnp.abs(q))
-    return blade.any_way(p / most, q / most)
+def _on_the_map(track: Track, frame: Frame, a: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A direction in the wheel's plane and along its axle, as one across and up the frame."""
+    slip = track.seen(frame)
+    s, n = a * jnp.cos(slip) + c * jnp.sin(slip), c * jnp.cos(slip) - a * jnp.sin(slip)
+    return s * frame.pose.cos - n * frame.pose.sin, s * frame.pose.sin + n * frame.pose.cos
 
 
 def handed_on(
