@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import blade, wheel
+from jaxsand import wheel
 from jaxsand.advance import Step
 from jaxsand.bed import at, truncate
 from jaxsand.block import Moving, View, pose_ahead
@@ -29,7 +29,7 @@ class Touchdown(Step):
 
     tape: int = 1
 
-    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
         way, frame = track.way, frame_of(self.block.shape, track.way.start)
         first = corner(frame, self.block.size, frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
@@ -71,7 +71,7 @@ class _Moved(Step):
         self,
         track: Track,
         view: View,
-        shares: blade.Shares,
+        shares: wheel.Shares,
         now: Stand,
         part: jax.Array,
         h: jax.Array,
@@ -97,7 +97,7 @@ class Turn(_Moved):
         far = jnp.minimum(jnp.hypot(track.radius, track.way.side), math.hypot(*self.block.shape))
         return self.substep / far
 
-    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
         way, whole = track.way, self._part(track)
         begin = k * whole
         ahead = jnp.clip(jnp.abs(way.angle) - begin, 0, whole)
@@ -129,7 +129,7 @@ class Roll(_Moved):
     def arrived(self, track: Track, k: jax.Array, _: Any) -> jax.Array:
         return (k >= self.lowered) & jnp.all((k - self.lowered) * (self.chunk * self.substep) >= track.way.length)
 
-    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
         way, block = track.way, self.block
         frame = frame_of(block.shape, way.start)
         last, first = (self._first(track, frame, j) for j in (jnp.maximum(k - 1, 0), k))

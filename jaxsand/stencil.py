@@ -37,6 +37,11 @@ def neighbour(x: jax.Array, di: int, dj: int) -> jax.Array:
     return _linear(lambda x: at(halo(x, 0.0), di, dj), lambda y: at(halo(y, 0.0), -di, -dj), x)
 
 
+def sees(u: jax.Array, di: int, dj: int) -> jax.Array:
+    """What each inner cell of a map with halo sees (di, dj) cells further, at most one."""
+    return _linear(lambda u: at(u, di, dj), lambda y: _placed(y, (1 + di, 1 - di), (1 + dj, 1 - dj)), u)
+
+
 def inner(u: jax.Array) -> jax.Array:
     """A map without its halo."""
     return _linear(at, lambda y: halo(y, 0.0), u)

@@ -24,12 +24,14 @@ from jaxsand.flux import NARROW, Fluxes
 from jaxsand.frame import Frame
 from jaxsand.grid import Neighbours
 from jaxsand.resting import Sand
-from jaxsand.stencil import both_ends, inner, outer, spread
+from jaxsand.stencil import both_ends, inner, outer, sees, spread
 
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it
 _PASSES = 4  # how many cells sand under the wheel moves on in a sub-step
 _ASIDE = 0.5  # how far to its side sand leaves the rim at its edges, to a unit ahead
 _LEAST = 1e-4
+_FOUR = ((0, 1), (0, -1), (1, 0), (-1, 0))
+Shares = tuple[jax.Array, ...]  # of the four straight neighbours, in a halo
 
 
 @jax.tree_util.register_dataclass
@@ -92,7 +94,7 @@ def cleared(old: Stand, new: Stand, h: jax.Array) -> jax.Array:
     return truncate(new.cover * below + jnp.maximum(part, inside) * above)
 
 
-def leaving(track: Track, frame: Frame, wheel: Stand) -> blade.Shares:
+def leaving(track: Track, frame: Frame, wheel: Stand) -> Shares:
     """The shares for the directions in which sand leaves the rim and, within two spacings of it, the leading flank.
 
     In the wheel's plane and along its axle, u from -1 at one flank to 1 at the other, beta the slip angle: off the rim
@@ -105,28 +107,33 @@ def leaving(track: Track, frame: Frame, wheel: Stand) -> blade.Shares:
     aside = jnp.clip(wheel.aside / track.way.side, -1, 1) * (_ASIDE * cos) + sin * hardly[0]
     a, c = cos + leads * (cos * hardly[1] - cos), aside + leads * (sin - aside)
     p, q = _on_the_map(track, frame, a, c)
-    most = jnp.maximum(jnp.maximum(jnp.abs(p), jnp.abs(q)), _LEAST)
-    return blade.any_way(p / most, q / most)
+    return _shares(p, q, jnp.ones_like(p))
 
 
-def turning(track: Track, frame: Frame, wheel: Stand, way: jax.Array) -> blade.Shares:
+def turning(track: Track, frame: Frame, wheel: Stand, way: jax.Array) -> Shares:
     """The shares for a turn in place, counter-clockwise where `way` is 1: along the axle, to where the wheel moves."""
     forward = jnp.clip(wheel.along, -1, 1) * way
     p, q = _on_the_map(track, frame, jnp.zeros_like(forward), forward)
-    size = jnp.maximum(jnp.maximum(jnp.abs(p), jnp.abs(q)), jnp.abs(forward))
-    size = jnp.where(size > 0, size, 1)
-    return blade.any_way(p / size, q / size)
+    return _shares(p, q, jnp.abs(forward))
 
 
-def radial(track: Track, frame: Frame, wheel: Stand) -> blade.Shares:
+def radial(track: Track, frame: Frame, wheel: Stand) -> Shares:
     """The shares for directions away from the wheel's centre, in the proportions of its chord and width; shorter within a
     cell of that."""
     along, across = wheel.along / track.way.half**2, wheel.aside / track.way.side**2
-    (p, q), (x, y) = _on_the_map(track, frame, along, across), _on_the_map(track, frame, wheel.along, wheel.aside)
-    size = jnp.maximum(jnp.abs(p), jnp.abs(q))
-    scale = jnp.minimum(jnp.maximum(jnp.abs(x), jnp.abs(y)), 1) / jnp.where(size > 0, size, 1)
-    scale = jnp.where(size > 0, scale, 0)
-    return blade.any_way(p * scale, q * scale)
+    p, q = _on_the_map(track, frame, along, across)
+    far = jnp.maximum(jnp.abs(wheel.along), jnp.abs(wheel.aside))
+    return _shares(p, q, jnp.minimum(far, 1))
+
+
+def _shares(p: jax.Array, q: jax.Array, size: jax.Array) -> Shares:
+    """The shares for directions across and up the frame, as |p| to |q|; of a `size` below 1 the rest goes all ways alike."""
+    length = jnp.abs(p) + jnp.abs(q)
+    scale = size / jnp.where(length > 0, length, 1)
+    p, q = p * scale, q * scale
+    rest = (1 - jnp.abs(p) - jnp.abs(q)) / 4
+    parts = (jnp.maximum(p, 0), jnp.maximum(-p, 0), jnp.maximum(q, 0), jnp.maximum(-q, 0))
+    return lax.optimization_barrier(tuple(outer(part + rest) for part in parts))
 
 
 def _on_the_map(track: Track, frame: Frame, a: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -140,7 +147,7 @@ def handed_on(
     block: Block,
     track: Track,
     view: View,
-    shares: blade.Shares,
+    shares: Shares,
     wheel: Stand,
     state: tuple[jax.Array, jax.Array | None, jax.Array],
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
@@ -148,15 +155,22 @@ def handed_on(
     cells and where there is room below the rim."""
     h, gone, carried = state
     over = block.over(_under(track.way, wheel), view, h + carried)
-    kept, got, lost = blade.handed_on(shares, view.holds, carried, None if over is None else (over[0], over[1] * carried))
+    kept, got, around = carried, jnp.zeros_like(h), outer(carried)
+    for (di, dj), part in zip(_FOUR, shares, strict=True):
+        here = inner(part)
+        kept = kept - truncate(here * carried) * at(view.holds, di, dj)
+        got = got + truncate(sees(part, -di, -dj) * sees(around, -di, -dj))
+        if over is not None and gone is not None:
+            lost = truncate(here * (over[1] * carried)) * at(over[0], di, dj)
+            kept, gone = kept - lost, gone + lost
+    got = got * at(view.holds)
     below = jnp.minimum(got, jnp.maximum(wheel.rim - h, 0))
     rest = truncate((1 - wheel.cover) * got + wheel.cover * below)
-    gone = gone if gone is None or lost is None else gone + lost
     return lax.optimization_barrier((h + rest + kept, gone, got - rest))
 
 
 def displaced(
-    block: Block, track: Track, view: View, shares: blade.Shares, wheel: Stand, h: jax.Array, taken: jax.Array
+    block: Block, track: Track, view: View, shares: Shares, wheel: Stand, h: jax.Array, taken: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
     """The heights (quanta) once what was taken up was handed on by some cells, and what was lost; what is still on its way
     waits where it is."""
