@@ -84,13 +84,14 @@ def stand(track: Track, frame: Frame, first: tuple[jax.Array, jax.Array], size: 
 def cleared(old: Stand, new: Stand, h: jax.Array) -> jax.Array:
     """The sand that has to leave the cells of a block as the wheel moves, in whole quanta.
 
-    Sand above the rim stood beside the wheel, in the open share of its cell, of which the wheel now covers a part; what is
-    still inside of the wheel, in cells without such a share, leaves as well.
+    Sand above the rim stood beside the wheel, in the open share of its cell, of which the wheel now covers a part. What is
+    still inside of the wheel leaves as well, in cells that it all but fills, which nothing flows into; not where the rim
+    rises, or sand that follows it from behind would be taken ahead, the more often the shorter the sub-steps.
     """
     above = jnp.maximum(h - jnp.maximum(old.rim, new.rim), 0)
     below = jnp.maximum(jnp.minimum(h, old.rim) - new.rim, 0)
     part = jnp.maximum(new.cover - old.cover, 0) / jnp.maximum(1 - old.cover, NARROW)
-    inside = jnp.clip(1 - (1 - new.cover) / NARROW, 0, 1)
+    inside = jnp.where(new.rim > old.rim, 0, jnp.clip(1 - (1 - new.cover) / NARROW, 0, 1))
     return truncate(new.cover * below + jnp.maximum(part, inside) * above)
 
 
@@ -212,7 +213,7 @@ def _gates(neighbours: Neighbours, wheel: Stand, touch: jax.Array, holds: jax.Ar
     A link is as open as the narrower of its cells, times 2 / (1 + narrower / wider), and no more than the wheel's two planes
     leave of it where they cut it.
     """
-    free = (1 - wheel.cover * touch) * at(holds)
+    free = (1 - jnp.minimum(wheel.cover / (1 - NARROW), 1) * touch) * at(holds)
     walls = [
         (wheel.aside, wheel.lengthwise * touch),  # across which the flanks part sand
         (wheel.along, wheel.crosswise * touch),  # and the rim
