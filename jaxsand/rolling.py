@@ -108,7 +108,7 @@ class Turn(_Moved):
         first = corner(frame, self.block.size, frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
         before, now = (wheel.stand(track, f, first, self.block.size) for f in (frame, after))
-        taken = jnp.where(ahead > 0, wheel.cleared(before, now, old), 0) * at(view.holds)
+        taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, old), 0) * at(view.holds)
         shares = wheel.turning(track, frame, before, sign)
         new, flux, gone = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
         cover = jnp.maximum(before.cover, now.cover)
@@ -141,7 +141,7 @@ class Roll(_Moved):
             h, flux, gone = state
             poses, ahead = self._poses(track, frame, k, i)
             before, now = (wheel.stand(track, f, first, block.size) for f in poses)
-            taken = jnp.where(ahead > 0, wheel.cleared(before, now, h), 0) * at(view.holds)
+            taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, h), 0) * at(view.holds)
             h, left = wheel.carried_back(track, poses[1], first, view, ahead, h, taken)
             h = h - taken + left
             still = k < self.lowered

@@ -81,18 +81,26 @@ def stand(track: Track, frame: Frame, first: tuple[jax.Array, jax.Array], size: 
     return lax.optimization_barrier(Stand(a, c, blade.share(a, -r, r), blade.share(c, -side, side), rim))
 
 
-def cleared(old: Stand, new: Stand, h: jax.Array) -> jax.Array:
+def cleared(track: Track, old: Stand, new: Stand, h: jax.Array) -> jax.Array:
     """The sand that has to leave the cells of a block as the wheel moves, in whole quanta.
 
-    Sand above the rim stood beside the wheel, in the open share of its cell, of which the wheel now covers a part. What is
+    Sand above the rim stood beside the wheel, in the open share of its cell, of which the wheel now sweeps a part. What is
     still inside of the wheel leaves as well, in cells that it all but fills, which nothing flows into; not where the rim
     rises, or sand that follows it from behind would be taken ahead, the more often the shorter the sub-steps.
     """
+    r, side = spread(track.radius, h), spread(track.way.side, h)
+    swept = _swept(old.along, new.along, r) * _swept(old.aside, new.aside, side)
     above = jnp.maximum(h - jnp.maximum(old.rim, new.rim), 0)
     below = jnp.maximum(jnp.minimum(h, old.rim) - new.rim, 0)
-    part = jnp.maximum(new.cover - old.cover, 0) / jnp.maximum(1 - old.cover, NARROW)
-    inside = jnp.where(new.rim > old.rim, 0, jnp.clip(1 - (1 - new.cover) / NARROW, 0, 1))
-    return truncate(new.cover * below + jnp.maximum(part, inside) * above)
+    part = jnp.maximum(swept - old.cover, 0) / jnp.maximum(1 - old.cover, NARROW)
+    inside = jnp.where(new.rim > old.rim, 0, jnp.clip(1 - (1 - swept) / NARROW, 0, 1))
+    return truncate(new.cover * below + jnp.clip(jnp.maximum(part, inside), 0, 1) * above)
+
+
+def _swept(old: jax.Array, new: jax.Array, half: jax.Array) -> jax.Array:
+    """The share of a cell that an interval of half the length `half` covers at any time on its way."""
+    near, far = jnp.minimum(old, new), jnp.maximum(old, new)
+    return jnp.clip(far + half + 0.5, 0, 1) - jnp.clip(near - half + 0.5, 0, 1)
 
 
 def leaving(track: Track, frame: Frame, wheel: Stand) -> Shares:

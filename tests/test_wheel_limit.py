@@ -42,38 +42,40 @@ def heap(spacing, rows=3, neighbours=8, way=0.16, sinkage=0.012):
 def test_the_heap_of_a_wheel_as_wide_as_its_bed_is_a_triangle(spacing, neighbours):
     """A rule that sweeps a fixed number of times heaped it 1.3, 1.6, 2.5 times as high on cells of 8, 4, 2 mm."""
     peak, error = heap(spacing, neighbours=neighbours)
-    assert peak == pytest.approx(1, abs=0.07)
+    assert peak == pytest.approx(1, abs=0.08)
     assert error < 0.05
 
 
-@pytest.mark.parametrize(("width", "degrees"), [(1.0, 22.5), (1.5, 0), (1.0, 45)])
+@pytest.mark.parametrize(("width", "degrees"), [(1.0, 20), (1.5, 0), (1.0, 30)])
 def test_a_wheel_dragged_broadside_is_a_wall(width, degrees):
     """Of a chord wider than the bed, it leaves behind it what its rim shaped: nothing got through."""
-    n, wheel = 24, js.Wheel(radius=0.33, width=width * DX, sinkage=0.06, slip_angle=math.pi / 2)
-    sand = js.make_scene((n, n), DX, ANGLE, tool=wheel)
+    shape, wheel = (12, 40), js.Wheel(radius=0.4, width=width * DX, sinkage=0.012, slip_angle=math.pi / 2)
+    sand = js.make_scene(shape, DX, ANGLE, tool=wheel)
     head = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees))])
-    start, end = 0.12 - 0.05 * head, 0.12 + 0.04 * head
-    h = np.asarray(js.act(sand, np.zeros((n, n)), [*start, *end]).height)
-    x, y = np.meshgrid((np.arange(n) + 0.5) * DX, (np.arange(n) + 0.5) * DX)
+    end = np.array([0.26, 0.06])
+    h = np.asarray(js.act(sand, np.zeros(shape), [*(end - 0.14 * head), *end]).height)
+    x, y = np.meshgrid((np.arange(shape[1]) + 0.5) * DX, (np.arange(shape[0]) + 0.5) * DX)
     along = (x - end[0]) * head[0] + (y - end[1]) * head[1]
     aside = (y - end[1]) * head[0] - (x - end[0]) * head[1]
     rim = wheel.radius - wheel.sinkage - np.sqrt(wheel.radius**2 - aside**2)
-    behind = (along < -0.5 * wheel.width - DX) & (along > -0.08) & (np.abs(aside) < 0.08)
-    assert (h - rim)[behind].max() < 0.01 * wheel.sinkage
-    assert volume_error(np.zeros((n, n)), h) < 1e-12
+    behind = (along < -0.5 * wheel.width - DX) & (along > -0.06)
+    assert (h - rim)[behind].max() < 0.05 * wheel.sinkage
+    assert volume_error(np.zeros(shape), h) < 1e-12
 
 
-def test_the_result_goes_to_a_limit_with_the_sub_step():
+@pytest.mark.slow
+def test_shorter_sub_steps_change_ever_less():
+    """Half of them in sum, from quarters to eighths to sixteenths of a spacing; a rule that drifts changes ever more."""
     strokes = np.array([[0.08, 0.1, 0.2, 0.17], [0.22, 0.2, 0.1, 0.12]])
-    sand = js.make_scene((32, 32), DX, ANGLE, tool=js.Wheel(slip_angle=0.4))
-    maps = [
-        np.asarray(js.step_batch(sand, np.zeros((2, 32, 32)), strokes, push=js.SteppedPush(a, 32)).height)
-        for a in (1 / 4, 1 / 8, 1 / 16)
-    ]
-    apart = [np.abs(a - b).sum() for a, b in itertools.pairwise(maps)]
-    print(apart, np.abs(maps[-1]).sum())
-    assert apart[1] < 0.75 * apart[0]
-    assert apart[1] < 0.04 * np.abs(maps[-1]).sum()
+    for slip in (0.0, 0.4):
+        sand = js.make_scene((32, 32), DX, ANGLE, tool=js.Wheel(slip_angle=slip))
+        maps = [
+            np.asarray(js.step_batch(sand, np.zeros((2, 32, 32)), strokes, push=js.SteppedPush(a, 16)).height)
+            for a in (1 / 4, 1 / 8, 1 / 16)
+        ]
+        apart = [np.abs(a - b).sum() for a, b in itertools.pairwise(maps)]
+        assert apart[1] < 0.85 * apart[0]
+        assert apart[1] < 0.03 * np.abs(maps[-1]).sum()
 
 
 def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
@@ -83,7 +85,6 @@ def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
         headings = math.pi * np.arange(parts + 1) / parts
         path = 0.16 + hair * np.concatenate([np.zeros((1, 2)), np.cumsum(np.c_[np.cos(headings), np.sin(headings)], 0)])
         maps.append(np.asarray(js.follow(sand, np.zeros((32, 32)), path).height))
-    print([np.abs(h - maps[0]).sum() / np.abs(maps[0]).sum() for h in maps])
     for h in maps[1:]:
         assert np.abs(h - maps[0]).sum() < 0.03 * np.abs(maps[0]).sum()
     x, y = np.meshgrid(np.arange(32) + 0.5 - 16, np.arange(32) + 0.5 - 16)
