@@ -28,6 +28,7 @@ from jaxsand.stencil import both_ends, inner, outer, sees, spread
 
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it
 _PASSES = 4  # how many cells sand under the wheel moves on in a sub-step
+_SLIVER = 0.002  # in an open share below this sand stands no higher than it would in this one
 _ASIDE = 0.5  # how far to its side sand leaves the rim at its edges, to a unit ahead
 _LEAST = 1e-4
 _FOUR = ((0, 1), (0, -1), (1, 0), (-1, 0))
@@ -92,7 +93,7 @@ def cleared(track: Track, old: Stand, new: Stand, h: jax.Array) -> jax.Array:
     above = jnp.maximum(h - jnp.maximum(old.rim, new.rim), 0)
     below = jnp.maximum(jnp.minimum(h, old.rim) - new.rim, 0)
     part = jnp.maximum(swept - old.cover, 0) / jnp.maximum(1 - old.cover, NARROW)
-    inside = jnp.clip(1 - (1 - swept) / NARROW, 0, 1) * (1 - _rising(track, new, 0))
+    inside = jnp.clip(1 - (1 - swept) / NARROW, 0, 1)
     return truncate(new.cover * below + jnp.clip(jnp.maximum(part, inside), 0, 1) * above)
 
 
@@ -197,9 +198,8 @@ def around(block: Block, track: Track, view: View, wheel: Stand, h: jax.Array) -
     """The sand around the wheel, and how much the wheel is among it, 0 to 1."""
     way = track.way
     touch = _touch(track, wheel, h)
-    felt = touch * (1 - NARROW * _rising(track, wheel, 1))
-    free, gates = _gates(block.neighbours, wheel, felt, touch, view.holds)
-    stretch = lax.optimization_barrier((1 - free) / jnp.maximum(free, NARROW))
+    free, gates = _gates(block.neighbours, wheel, touch, view.holds)
+    stretch = lax.optimization_barrier((1 - free) / jnp.maximum(free, _SLIVER))
     level = None if way.level is None else way.level / way.quantum
     sand = Sand(gates, free, stretch, wheel.rim, view.drop, view.sides, level, block.neighbours)
     return sand, contact(_under(way, wheel), view, wheel.cover, h)
@@ -215,25 +215,13 @@ def _under(way: Way, wheel: Stand) -> Way:
     return replace(way, bottom=wheel.rim * way.quantum)
 
 
-def _rising(track: Track, wheel: Stand, behind: int) -> jax.Array:
-    """Where the rim rises as the wheel moves on, and sand follows it, 0 to 1: so many spacings behind the axle.
-
-    A cell stays a little open there even where sand touches the rim. Were it to open and close by turns, what follows would
-    depend on the last digit; and what presses against the rim from behind must not be taken ahead, the more often the
-    shorter the sub-steps.
-    """
-    return jnp.clip(-wheel.along - behind, 0, 1) * jnp.clip(2 * jnp.cos(track.slip), 0, 1)
-
-
-def _gates(
-    neighbours: Neighbours, wheel: Stand, felt: jax.Array, touch: jax.Array, holds: jax.Array
-) -> tuple[jax.Array, Fluxes]:
+def _gates(neighbours: Neighbours, wheel: Stand, touch: jax.Array, holds: jax.Array) -> tuple[jax.Array, Fluxes]:
     """The open share of each cell, and how open each link is; `holds` is 1 where a cell can hold sand, in a halo.
 
     A link is as open as the narrower of its cells, times 2 / (1 + narrower / wider), and no more than the wheel's two planes
     leave of it where they cut it.
     """
-    free = (1 - jnp.minimum(wheel.cover / (1 - NARROW), 1) * felt) * at(holds)
+    free = (1 - jnp.minimum(wheel.cover / (1 - NARROW), 1) * touch) * at(holds)
     walls = [
         (wheel.aside, wheel.lengthwise * touch),  # across which the flanks part sand
         (wheel.along, wheel.crosswise * touch),  # and the rim
