@@ -73,8 +73,8 @@ def value_and_grad_batch(
       args: arrays, or trees of them, with a leading axis of length B.
 
     Returns:
-      The losses [B], and the gradients by the maps [B, H, W] and by the strokes [B, 4]. NaN where the simulator's outcome is
-      not clean.
+      The losses [B], and the gradients by the maps [B, H, W] and by the strokes [B, 4]. NaN where the outcome is not finite, or
+      where sand reached the edge of the scene's own window.
 
     Example:
       >>> def miss(height, goal):
@@ -85,7 +85,7 @@ def value_and_grad_batch(
     chunk = _GRADIENTS if chunk is None and jax.default_backend() == "cpu" else chunk
     args = jax.tree.map(jnp.asarray, args)
     value, *slopes, outcome = _batch(program, scene, height, stroke, (push, scheme, stop), chunk, args)
-    clean = np.asarray(outcome) == 0
+    clean = np.asarray(outcome) & (Outcome.NOT_FINITE | Outcome.WINDOW_EDGE) == 0
     value, by_height, by_stroke = (jnp.where(clean.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan) for x in (value, *slopes))
     return value, (by_height, by_stroke)
 

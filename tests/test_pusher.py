@@ -1,0 +1,71 @@
+"""Many pushes at once: every map as it would come out alone, its loss and gradient too; what is refused."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsand as js
+from jaxsand.pusher import act_batch
+
+QUICK = {"push": js.SteppedPush(1.0, 2), "stop": js.Sweeps(8)}
+SAND = js.make_scene((9, 9), 0.01, 0.5, tool=js.Blade(0.025, 0.015, 0.006))
+RNG = np.random.default_rng(0)
+MAPS = RNG.normal(0, 1e-3, (5, 9, 9))
+STROKES = RNG.uniform(0.02, 0.07, (5, 4))
+WEIGHTS = RNG.normal(size=(5, 9, 9))
+
+
+def weighed(height, weight):
+    return jnp.sum(weight * height)
+
+
+def alone(height, stroke, weight):
+    return weighed(js.step(SAND, height, stroke, **QUICK).height, weight)
+
+
+def test_losses_and_gradients_are_those_of_each_map_alone():
+    value, slopes = js.value_and_grad_batch(SAND, weighed, MAPS, STROKES, WEIGHTS, chunk=2, **QUICK)
+    want, wanted = jax.vmap(jax.value_and_grad(alone, argnums=(0, 1)))(MAPS, STROKES, WEIGHTS)
+    assert np.allclose(value, want, atol=1e-12)
+    for found, slope in zip(slopes, wanted, strict=True):
+        assert np.abs(slope).max() > 0
+        assert np.allclose(found, slope, atol=1e-9)
+
+
+def test_what_is_not_clean_has_no_loss_and_no_gradient():
+    strokes = STROKES.copy()
+    strokes[3, 1] = np.nan
+    value, (by_height, by_stroke) = js.value_and_grad_batch(SAND, weighed, MAPS, strokes, WEIGHTS, chunk=2, **QUICK)
+    for found in (value, by_height, by_stroke):
+        bad = np.isnan(np.asarray(found).reshape(5, -1))
+        assert bad[3].all()
+        assert not np.delete(bad, 3, 0).any()
+
+
+def test_acting_leaves_the_sand_as_the_tool_did():
+    found = act_batch(SAND, MAPS, STROKES, push=QUICK["push"]).height
+    want = jax.vmap(lambda h, s: js.act(SAND, h, s, push=QUICK["push"]).height)(MAPS, STROKES)
+    assert np.allclose(found, want, atol=1e-12)
+
+
+def test_large_maps_are_pushed_in_windows_and_again_where_these_are_too_small():
+    """A window made for the blade alone does not hold the heap of a deep map of ridges; the results are the whole map's."""
+    sand = js.make_scene((40, 40), 0.01, 0.5, tool=js.Blade())
+    x = np.linspace(0, 4 * np.pi, 40)
+    maps = np.stack([np.zeros((40, 40)), 0.02 * np.sin(x)[:, None] * np.ones(40)])
+    maps = np.asarray(js.settle_batch(sand, maps).height)
+    strokes = np.array([[0.1, 0.1, 0.2, 0.15], [0.2, 0.05, 0.22, 0.3]])
+    found = act_batch(sand, maps, strokes)
+    want = jax.jit(jax.vmap(partial(js.act, sand)))(maps, strokes)
+    assert not np.asarray(found.outcome).any()
+    assert np.abs(found.height - want.height).max() < 2e-4
+
+
+def test_what_is_refused():
+    with pytest.raises(ValueError, match=r"stroke: got shape \[5, 3\]; give \[5, 4\]"):
+        js.value_and_grad_batch(SAND, weighed, MAPS, STROKES[:, :3], WEIGHTS)
+    with pytest.raises(ValueError, match=r"outermost programs: .*use jax\.vmap"):
+        jax.jit(partial(js.step_batch, SAND))(MAPS, STROKES)
