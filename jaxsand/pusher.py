@@ -73,8 +73,8 @@ def value_and_grad_batch(
       args: arrays, or trees of them, with a leading axis of length B.
 
     Returns:
-      The losses [B], and the gradients by the maps [B, H, W] and by the strokes [B, 4]. NaN where the outcome is not finite, or
-      where sand reached the edge of the scene's own window.
+      The losses [B], and the gradients by the maps [B, H, W] and by the strokes [B, 4]. NaN where the outcome is not finite,
+      or where sand reached the edge of the scene's own window.
 
     Example:
       >>> def miss(height, goal):
