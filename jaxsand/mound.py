@@ -1,0 +1,80 @@
+"""A mound of sand at repose that leans on a blade's face.
+
+At the distance r from the face it is mu (R - r) high, mu = tan(angle of repose) and R its reach: a wedge across the blade
+and a quarter of a cone at each end. Over level sand without bounds its volume is w mu R^2 / 2 + (pi / 6) mu R^3, w the
+blade's width; beside walls there are no cones, and V = w mu R^2 / 2 is the right triangle of peak sqrt(2 mu V / w) and toe
+sqrt(2 V / (mu w)). Whatever bounds the sand, R is such that the cells that hold sand hold V.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+Holds = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+_STEPS = 3  # of Newton's, from above: the volume is a convex function of the reach
+_FARTHEST = 64.0  # times the reach without bounds, in a cell and less
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lean:
+    """Where a mound may lie: the distance `far` of cells from the face (m), and the part `share` of each that counts."""
+
+    far: jax.Array
+    share: jax.Array
+
+
+def lean(u: jax.Array, m: jax.Array, dx: jax.Array, sand: jax.Array) -> Lean:
+    """Ahead of a face, from u, how far ahead of it cells lie, and m, how far beyond its ends (m)."""
+    first, last = jnp.maximum(u - dx / 2, 0), jnp.maximum(u + dx / 2, 0)
+    return Lean(distance((first + last) / 2, beyond(m, dx)), (last - first) / dx * sand)
+
+
+def beyond(m: jax.Array, dx: jax.Array) -> jax.Array:
+    """The mean of max(m, 0) over a spacing."""
+    return jnp.clip(m + dx / 2, 0, dx) ** 2 / (2 * dx) + jnp.maximum(m - dx / 2, 0)
+
+
+def distance(a: jax.Array, b: jax.Array) -> jax.Array:
+    """sqrt(a^2 + b^2), with a derivative at 0."""
+    square = a * a + b * b
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def heights(where: Lean, reach: jax.Array, dx: jax.Array) -> jax.Array:
+    """The mound's mean heights over cells, over mu; exact straight ahead of the face."""
+    z, b = reach - where.far, where.share * dx / 2
+    return jnp.clip(z + b, 0, 2 * b) ** 2 / (2 * dx) + where.share * jnp.maximum(z - b, 0)
+
+
+def unbounded(volume: jax.Array, width: jax.Array, dx: jax.Array) -> jax.Array:
+    """An upper bound of a mound's reach where nothing is in its way; `volume` is the sum of its heights, over mu (m)."""
+    return jnp.sqrt(2 * jnp.maximum(volume, 0) * dx * dx / jnp.maximum(width, dx) + (dx / 16) ** 2)
+
+
+def held(where: Lean, reach: jax.Array, dx: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The sum of a mound's heights, over mu, and its derivative by the reach."""
+    z, b = reach - where.far, where.share * dx / 2
+    part = jnp.clip(z + b, 0, 2 * b)
+    return _sum(part**2 / (2 * dx) + where.share * jnp.maximum(z - b, 0)), _sum(part / dx)
+
+
+def _sum(x: jax.Array) -> jax.Array:
+    return jnp.sum(jnp.sum(x, axis=0))  # rows first: XLA vectorises that
+
+
+def reach_of(volume: jax.Array, start: jax.Array, holds: Holds, dx: jax.Array) -> jax.Array:
+    """The reach R at which holds(R), with its derivative, is `volume` (sums of heights, over mu): Newton's method."""
+    most = lax.stop_gradient(_FARTHEST * (start + dx))
+
+    def better(reach: jax.Array, wanted: jax.Array) -> jax.Array:
+        there, slope = holds(reach)
+        return jnp.clip(reach + (wanted - there) / lax.stop_gradient(jnp.maximum(slope, 1e-3)), 0, most)
+
+    reach = lax.stop_gradient(start)
+    for _ in range(_STEPS):
+        reach = lax.stop_gradient(better(reach, lax.stop_gradient(volume)))
+    return better(reach, volume)
