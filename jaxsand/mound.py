@@ -6,6 +6,7 @@ blade's width; beside walls there are no cones, and V = w mu R^2 / 2 is the righ
 sqrt(2 V / (mu w)). Whatever bounds the sand, R is such that the cells that hold sand hold V.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 Holds = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
-_STEPS = 3  # of Newton's, from above: the volume is a convex function of the reach
+_STEPS = 1  # of Newton's: the volume is a convex function of the reach
 _FARTHEST = 64.0  # times the reach without bounds, in a cell and less
 
 
@@ -50,9 +51,15 @@ def heights(where: Lean, reach: jax.Array, dx: jax.Array) -> jax.Array:
     return jnp.clip(z + b, 0, 2 * b) ** 2 / (2 * dx) + where.share * jnp.maximum(z - b, 0)
 
 
-def unbounded(volume: jax.Array, width: jax.Array, dx: jax.Array) -> jax.Array:
-    """An upper bound of a mound's reach where nothing is in its way; `volume` is the sum of its heights, over mu (m)."""
-    return jnp.sqrt(2 * jnp.maximum(volume, 0) * dx * dx / jnp.maximum(width, dx) + (dx / 16) ** 2)
+def unbounded(volume: jax.Array, width: jax.Array, open_: jax.Array, dx: jax.Array) -> jax.Array:
+    """A mound's reach where nothing is in its way, the share `open_` of its ends apart; `volume` is the sum of its heights,
+    over mu (m)."""
+    wanted, width = jnp.maximum(volume, 0) * dx * dx, jnp.maximum(width, dx)
+    reach = jnp.sqrt(2 * wanted / width + (dx / 16) ** 2)
+    for _ in range(3):
+        held = (width / 2 + math.pi / 6 * open_ * reach) * reach**2
+        reach = reach - (held - wanted) / ((width + math.pi / 2 * open_ * reach) * reach)
+    return jnp.maximum(reach, dx / 16)
 
 
 def held(where: Lean, reach: jax.Array, dx: jax.Array) -> tuple[jax.Array, jax.Array]:
