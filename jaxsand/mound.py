@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 Holds = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
-_STEPS = 1  # of Newton's: the volume is a convex function of the reach
+_STEPS = 2  # of Newton's: the volume is a convex function of the reach
 _FARTHEST = 64.0  # times the reach without bounds, in a cell and less
 
 
@@ -75,13 +74,9 @@ def _sum(x: jax.Array) -> jax.Array:
 
 def reach_of(volume: jax.Array, start: jax.Array, holds: Holds, dx: jax.Array) -> jax.Array:
     """The reach R at which holds(R), with its derivative, is `volume` (sums of heights, over mu): Newton's method."""
-    most = lax.stop_gradient(_FARTHEST * (start + dx))
-
-    def better(reach: jax.Array, wanted: jax.Array) -> jax.Array:
-        there, slope = holds(reach)
-        return jnp.clip(reach + (wanted - there) / lax.stop_gradient(jnp.maximum(slope, 1e-3)), 0, most)
-
-    reach = lax.stop_gradient(start)
+    most = _FARTHEST * (start + dx)
+    reach = start
     for _ in range(_STEPS):
-        reach = lax.stop_gradient(better(reach, lax.stop_gradient(volume)))
-    return better(reach, volume)
+        there, slope = holds(reach)
+        reach = jnp.clip(reach + (volume - there) / jnp.maximum(slope, 1e-3), 0, most)
+    return reach
