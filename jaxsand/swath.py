@@ -61,8 +61,8 @@ class SwathPush:
 
     | depth / width | 1/15 | 1/4 | 1/3 | 1/2 | 1 |
     |---|---|---|---|---|---|
-    | strokes 3.3 widths long | 28% | 22% | 25% | 39% | 71% |
-    | as long as the blade is thick | | 20% | | 28% | |
+    | strokes 3.3 widths long | 28% | 22% | 25% | 40% | 73% |
+    | as long as the blade is thick | | 19% | | 28% | |
     | of no length | | 23% | | 22% | |
 
     and 42% for a blade 1.5 cells thick; 27% for the default blade on cells of 1 cm. After each leg but the last
