@@ -2,9 +2,11 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxsand.scene import Scene
+from jaxsand.tool import Pose
 from jaxsand.walls import Walls
 
 _BENDS = 2
@@ -31,6 +33,22 @@ def _along(seen: jax.Array, sand: jax.Array, axis: int) -> jax.Array:
     forth, _ = lax.associative_scan(join, (seen, sand), axis=axis)
     back, _ = lax.associative_scan(join, (seen, sand), reverse=True, axis=axis)
     return jnp.maximum(forth, back)
+
+
+def inside(scene: Scene, pose: Pose, s: jax.Array, n: jax.Array, dx: jax.Array) -> jax.Array:
+    """How far places, s along a heading and n across, lie from the map's nearest edge (m), below 0 outside of it."""
+    rows, columns = scene.grid.shape
+    x, y = pose.x + s * pose.cos - n * pose.sin, pose.y + s * pose.sin + n * pose.cos
+    return jnp.minimum(jnp.minimum(x, columns * dx - x), jnp.minimum(y, rows * dx - y))
+
+
+def on_line(
+    scene: Scene, pose: Pose, place: jax.Array, across: jax.Array, dx: jax.Array, weights: np.ndarray | None = None
+) -> jax.Array:
+    """How much of lines across a heading, at `place` [n] along it, is on the map: a mean over the places `across` [m]."""
+    away = inside(scene, pose, place[:, None], jnp.asarray(across, place.dtype)[None], dx)
+    on = jnp.clip(away / dx + 0.5, 0, 1)
+    return jnp.mean(on, axis=1) if weights is None else on @ jnp.asarray(weights, on.dtype)
 
 
 def between(field: jax.Array, column: jax.Array, row: jax.Array) -> jax.Array:

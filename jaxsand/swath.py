@@ -25,6 +25,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxsand.bed import Lost, lose
@@ -33,8 +34,10 @@ from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
 from jaxsand.mound import Lean, heights, held, lean, reach_of, unbounded
 from jaxsand.overflow import Rim, nothing_beyond
 from jaxsand.scene import Scene
-from jaxsand.shade import within_reach
+from jaxsand.shade import on_line, within_reach
+from jaxsand.slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
 from jaxsand.tool import Pose, coverage, local
+from jaxsand.walls import Walls
 from jaxsand.window import Whole
 
 # Shapes, fitted to SteppedPush.fine() with blades of 2 to 16 cells; lengths are shares of the reach r, or cells.
@@ -48,6 +51,8 @@ _NEAR = 0.48  # how far the berms reach from there
 _INTO, _DEEP = 0.78, 0.3  # 1 - exp(-_INTO - _DEEP (r / w)^3) of the berms has slid back into the trench behind the blade
 _INNER = 0.93  # how far it is strewn
 _BACK = 0.67  # of the sand under the blade when it is lowered: what leaves behind it and to its sides
+_FAR = 50.0  # times the blade's thickness: no sand comes from farther back sooner than from there
+_ACROSS = (np.arange(16) - 7.5) / 8
 ROOM = 0.25  # with less room than this part of a profile's own, sand is held back
 
 
@@ -117,15 +122,18 @@ def _sweep_out(  # noqa: PLR0915
     thick = jnp.maximum(dx, (end - origin) / (count - 1))
     place = origin + slices * thick
     at = (s - origin) / thick
-    hats = lax.optimization_barrier(hat(at[None], slices[:, None]))
     seen = within_reach(scene, jnp.maximum(cover, under), sand)
 
-    swept = lax.optimization_barrier(cover * sand)
+    swept = cover * sand
     area = jnp.sum(swept)
     depth = jnp.maximum(jnp.sum(taken) / jnp.where(area > 0, area, 1), dx / 1000)
     mu = typical_drop(job, (cover + 1e-6 * under) * sand) / dx
-    widths = _in_slices(hats, swept) * (dx * dx / thick)
-    width = jnp.maximum(jnp.sum(widths**2) / jnp.where(area > 0, area * dx * dx / thick, 1), dx)
+    if isinstance(scene.walls, Walls):
+        widths = in_slices(at, count, swept) * (dx * dx / thick)
+    else:
+        along = to_slice((end - place) / thick) - to_slice((-half - place) / thick)
+        widths = 2 * side * along * on_line(scene, pose, place, side * _ACROSS, dx)
+    width = jnp.maximum(jnp.sum(widths**2) / jnp.where(jnp.sum(widths) > 0, jnp.sum(widths), 1), dx)
     reach = jnp.sqrt(tool.width * depth / mu)
 
     rim = None
@@ -140,9 +148,13 @@ def _sweep_out(  # noqa: PLR0915
     left = jnp.clip(n / dx + 0.5, 0, 1)
     outside = wedge(off - _GAP * reach - _GAP_CELLS * dx, near, dx) * (1 - into) * seen
     inside = wedge(-off, inner, dx) * (into / (part * (2 - part))) * seen
-    profiles = (left * outside, (1 - left) * outside, left * inside, (1 - left) * inside)
-    profiles = lax.optimization_barrier(profiles)
-    rooms = jnp.stack([_in_slices(hats, x) for x in profiles]) * (dx / thick)
+    if isinstance(scene.walls, Walls):
+        profiles = (left * outside, (1 - left) * outside, left * inside, (1 - left) * inside)
+        rooms = jnp.stack([in_slices(at, count, x) for x in profiles]) * (dx / thick)
+    else:
+        farther, nearer = side + _GAP * reach + _GAP_CELLS * dx + near * POINTS, side - jnp.minimum(inner, side) * POINTS
+        rooms = jnp.stack([on_line(scene, pose, place, x, dx, WEIGHTS) for x in (farther, -farther, nearer, -nearer)])
+        rooms = rooms * jnp.stack([1 - into, 1 - into, into, into])[:, None]
     beyond = jnp.zeros_like(rooms[:2])
     if rim is not None:
         beyond = rim.berms(pose, place, side, reach, mu * reach, dx) * (1 - into)
@@ -158,8 +170,8 @@ def _sweep_out(  # noqa: PLR0915
         there = hat(jnp.clip(-origin / thick, 0, count - 1)[None, None], slices)[:, 0]
         back = _BACK + (0.5 - _BACK) * (1 - jnp.max(open_ @ there))
         ring, back = _ring(first_pose, job, under, seen, jnp.sum(first), back, mu)
-    onward = lax.optimization_barrier(taken - first * back)
-    ahead = _in_slices(hats, onward)
+    onward = taken - first * back
+    ahead = in_slices(at, count, onward)
     ahead = ahead.at[-1].add(jnp.sum(onward * jnp.clip(at - (count - 1), 0, 1)))  # what sticks out of the last slice
     before = jnp.where(place < half, ahead, 0)
     early = jnp.sum(before) + jnp.sum(onward * jnp.clip(-at, 0, 1))
@@ -175,14 +187,13 @@ def _sweep_out(  # noqa: PLR0915
     # Setting it down.
     room = rooms[:2] + rooms[2:] + beyond
     density = (left_there / jnp.where(flanks > 0, 2 * flanks, 1))[None] * open_ / jnp.where(room > 0, room, 1)
-    on_left, on_right = (jnp.sum(x[:, None, None] * (dx / thick) * hats, axis=0) for x in density)
-    put = (left * on_left + (1 - left) * on_right) * (outside + inside)
+    put = of_slices(at, left, density * (dx / thick)) * (outside + inside)
+    wanted, there = jnp.sum(density * (room - beyond)), jnp.sum(jnp.sum(put, axis=0))
+    scale = wanted / jnp.where(wanted > 0, jnp.maximum(there, wanted / 2), 1)
     heap, kept, gone = _heap(job, pose, end, heaped, h, seen, open_ @ there_end, width, mu, rim)
-    put = put + ring + heap
-    put, taken = lax.optimization_barrier((put, taken))
-    last = lax.stop_gradient(jnp.max(jnp.max(jnp.where(taken > 0, s, -jnp.inf), axis=0)))
-    last = lax.optimization_barrier(taken * jnp.exp(jnp.minimum(jnp.where(taken > 0, s - last, 0), 0) / (2 * half)))
-    put = lax.optimization_barrier(whole(job, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1))))
+    put, kept = put * scale + ring + heap, kept + (wanted - there * scale)
+    last = taken * jnp.exp(jnp.clip((s - end) / (2 * half), -_FAR, 0))
+    put = whole(job, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1)))
     if lost is not None:
         every = jnp.sum(taken)
         gone = gone + jnp.sum(density * beyond)
@@ -200,7 +211,6 @@ def _ring(
     s, n = local(pose, job.x, job.y)
     behind = lean(-half - s, jnp.abs(n) - side, dx, sand)
     where = Lean(behind.far, (1 - under) * jnp.clip((half - s) / dx + 0.5, 0, 1) * sand)
-    where = lax.optimization_barrier(where)
     start = unbounded(back * first / mu, jnp.asarray(tool.width), jnp.ones_like(mu), dx)
     room, _ = held(where, start, dx)
     back = back * jnp.minimum(room * mu / jnp.where(first > 0, ROOM * back * first, 1), 1)
@@ -225,9 +235,9 @@ def _heap(
     """The heap ahead of the blade, what finds no room there, and what runs off over the rim."""
     dx, side = job.bed.spacing, jnp.asarray(job.tool.width) / 2
     s, n = local(pose, job.x, job.y)
-    where = lean(s - end - _AHEAD * dx * (open_[0] + open_[1]) / 2, jnp.abs(n) - side, dx, sand)
+    where = lean(s - end - _AHEAD * dx * jnp.maximum(open_[0], open_[1]), jnp.abs(n) - side, dx, sand)
     falls = open_[0] * jnp.clip(n, 0, side) + open_[1] * jnp.clip(-n, 0, side)
-    where = lax.optimization_barrier(Lean(where.far + _FALL * falls, where.share))
+    where = Lean(where.far + _FALL * falls, where.share)
     start = unbounded(volume / mu, width, (open_[0] + open_[1]) / 2, dx)
     beyond = nothing_beyond if rim is None else rim.beyond(pose, end, side, start, mu, dx)
 
@@ -247,11 +257,6 @@ def _heap(
     return heap, volume - placed, gone
 
 
-def _in_slices(hats: jax.Array, amount: jax.Array) -> jax.Array:
-    """How much of an amount [H, W] belongs to each slice; rows first: XLA vectorises that."""
-    return jnp.sum(jnp.sum(hats * amount[None], axis=1), axis=1)
-
-
 def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
     """The largest stable step, its mean by weight where it differs from cell to cell."""
     drop = job.bed.drop
@@ -266,8 +271,12 @@ def complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:
     # The counts fit their integers or wrap around; their sum is right, since what is left over is small.
     quanta = jnp.round(lax.stop_gradient(taken - put) / job.flow.quantum)
     rest = jnp.sum(quanta.astype(jnp.int64 if put.dtype == jnp.float64 else jnp.int32)).astype(put.dtype)
-    here = jnp.arange(put.size) == jnp.argmax(put.ravel())
-    return put + jnp.where(here, rest * job.flow.quantum, 0).reshape(put.shape)
+    # Its column, then its row: XLA vectorises the largest of each column, but not an argmax over the map.
+    shown = lax.stop_gradient(put)
+    column = jnp.argmax(jnp.max(shown, axis=0))
+    row = jnp.argmax(shown[:, column])
+    here = (jnp.arange(put.shape[0])[:, None] == row) & (jnp.arange(put.shape[1])[None, :] == column)
+    return put + jnp.where(here, rest * job.flow.quantum, 0)
 
 
 def _heap_balance(gains: jax.Array, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -279,18 +288,3 @@ def _heap_balance(gains: jax.Array, shares: jax.Array) -> tuple[jax.Array, jax.A
         return volume + gain - left, left
 
     return lax.scan(pass_by, jnp.zeros_like(gains[0]), (gains, shares))
-
-
-def hat(at: jax.Array, slices: jax.Array) -> jax.Array:
-    """How much of a place belongs to each slice [k, ...]."""
-    return jnp.maximum(1 - jnp.abs(at - slices[:, None]), 0)
-
-
-def wedge(u: jax.Array, reach: jax.Array, dx: jax.Array) -> jax.Array:
-    """The mean over a spacing around u of a wedge on [0, reach] that falls to 0; they add up to 1."""
-
-    def area(u: jax.Array) -> jax.Array:
-        part = jnp.clip(u / reach, 0, 1)
-        return part * (2 - part)
-
-    return area(u + dx / 2) - area(u - dx / 2)

@@ -11,7 +11,7 @@ README = Path(__file__).parent.parent / "README.md"
 
 # A file imports only from floors below its own, and never from a neighbour. A folder has a floor, and floors inside.
 FLOORS = [
-    {"grid", "material", "walls", "window", "tool", "lockstep", "fitting", "turns"},
+    {"grid", "material", "walls", "window", "tool", "lockstep", "fitting", "turns", "slices"},
     {"scene", "loop"},
     {"bed", "schemes", "forces"},
     {"flux", "rules", "adjoint"},
