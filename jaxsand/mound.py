@@ -46,8 +46,8 @@ def distance(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def heights(where: Lean, reach: jax.Array, dx: jax.Array) -> jax.Array:
     """The mound's mean heights over cells, over mu; exact straight ahead of the face."""
-    z, b = reach - where.far, where.share * dx / 2
-    return jnp.clip(z + b, 0, 2 * b) ** 2 / (2 * dx) + where.share * jnp.maximum(z - b, 0)
+    part, above = _parts(where, reach, dx)
+    return part**2 / (2 * dx) + where.share * above
 
 
 def unbounded(volume: jax.Array, width: jax.Array, open_: jax.Array, dx: jax.Array) -> jax.Array:
@@ -63,9 +63,15 @@ def unbounded(volume: jax.Array, width: jax.Array, open_: jax.Array, dx: jax.Arr
 
 def held(where: Lean, reach: jax.Array, dx: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The sum of a mound's heights, over mu, and its derivative by the reach."""
+    part, above = _parts(where, reach, dx)
+    return _sum(part**2 / (2 * dx) + where.share * above), _sum(part) / dx
+
+
+def _parts(where: Lean, reach: jax.Array, dx: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """How much of each cell's length the mound's top passes over its start, and how high it is above its end."""
     z, b = reach - where.far, where.share * dx / 2
-    part = jnp.clip(z + b, 0, 2 * b)
-    return _sum(part**2 / (2 * dx) + where.share * jnp.maximum(z - b, 0)), _sum(part / dx)
+    start, end = z + b, z - b
+    return jnp.where(end > 0, 2 * b, jnp.where(start > 0, start, 0)), jnp.where(end > 0, end, 0)
 
 
 def _sum(x: jax.Array) -> jax.Array:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxsand.displace import Job
 from jaxsand.mound import Holds, distance
 from jaxsand.scene import Scene
-from jaxsand.shade import between
+from jaxsand.shade import between, inside, spot
 from jaxsand.tool import Pose
 
 
@@ -35,15 +35,11 @@ class Rim:
         dx, (rows, columns) = job.bed.spacing, scene.grid.shape
         return cls((columns * dx, rows * dx), job.bed.rim.level, ground, jnp.ones(2, sand.dtype), _from_edge(sand), seen)
 
-    def inside(self, x: jax.Array, y: jax.Array) -> jax.Array:
-        """How far places lie from the nearest edge (m), below 0 outside of the map."""
-        return jnp.minimum(jnp.minimum(x, self.size[0] - x), jnp.minimum(y, self.size[1] - y))
-
     def outside(self, pose: Pose, s: jax.Array, n: jax.Array, seen: jax.Array, dx: jax.Array) -> jax.Array:
         """1 beyond the edge, smoothed over a spacing, where cells on this side are `seen`; s along and n across."""
-        x, y = pose.x + s * pose.cos - n * pose.sin, pose.y + s * pose.sin + n * pose.cos
+        x, y = spot(pose, s, n)
         free = between(seen, x / dx - 0.5, y / dx - 0.5)
-        return jnp.clip(0.5 - self.inside(x, y) / dx, 0, 1) * jnp.clip(2 * free - 1, 0, 1)
+        return jnp.clip(0.5 - inside(self.size, x, y) / dx, 0, 1) * jnp.clip(2 * free - 1, 0, 1)
 
     def berms(
         self, pose: Pose, place: jax.Array, side: jax.Array, reach: jax.Array, peak: jax.Array, dx: jax.Array
@@ -52,8 +48,8 @@ class Rim:
         than the rim."""
         off = side + reach / 3
         out = jnp.stack([self.outside(pose, place, n, self.seen, dx) for n in (off, -off)])
-        inside = jnp.stack([self.outside(pose, place, n, self.seen, dx) for n in (-side, 0 * side, side)])
-        return out * (1 - jnp.min(inside, axis=0))[None] * jnp.clip(1 - (self.level - self.ground) / peak, 0, 1)
+        under = jnp.stack([self.outside(pose, place, n, self.seen, dx) for n in (-side, 0 * side, side)])
+        return out * (1 - jnp.min(under, axis=0))[None] * jnp.clip(1 - (self.level - self.ground) / peak, 0, 1)
 
     def beyond(
         self, pose: Pose, end: jax.Array, side: jax.Array, farthest: jax.Array, mu: jax.Array, dx: jax.Array

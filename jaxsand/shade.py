@@ -35,18 +35,23 @@ def _along(seen: jax.Array, sand: jax.Array, axis: int) -> jax.Array:
     return jnp.maximum(forth, back)
 
 
-def inside(scene: Scene, pose: Pose, s: jax.Array, n: jax.Array, dx: jax.Array) -> jax.Array:
-    """How far places, s along a heading and n across, lie from the map's nearest edge (m), below 0 outside of it."""
-    rows, columns = scene.grid.shape
-    x, y = pose.x + s * pose.cos - n * pose.sin, pose.y + s * pose.sin + n * pose.cos
-    return jnp.minimum(jnp.minimum(x, columns * dx - x), jnp.minimum(y, rows * dx - y))
+def spot(pose: Pose, s: jax.Array, n: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where on the map places lie that are s along a heading and n across it (m)."""
+    return pose.x + s * pose.cos - n * pose.sin, pose.y + s * pose.sin + n * pose.cos
+
+
+def inside(size: tuple[jax.Array, jax.Array], x: jax.Array, y: jax.Array) -> jax.Array:
+    """How far places lie from the nearest edge of a map of a `size` (m), below 0 outside of it."""
+    return jnp.minimum(jnp.minimum(x, size[0] - x), jnp.minimum(y, size[1] - y))
 
 
 def on_line(
     scene: Scene, pose: Pose, place: jax.Array, across: jax.Array, dx: jax.Array, weights: np.ndarray | None = None
 ) -> jax.Array:
     """How much of lines across a heading, at `place` [n] along it, is on the map: a mean over the places `across` [m]."""
-    away = inside(scene, pose, place[:, None], jnp.asarray(across, place.dtype)[None], dx)
+    rows, columns = scene.grid.shape
+    x, y = spot(pose, place[:, None], jnp.asarray(across, place.dtype)[None])
+    away = inside((columns * dx, rows * dx), x, y)
     on = jnp.clip(away / dx + 0.5, 0, 1)
     return jnp.mean(on, axis=1) if weights is None else on @ jnp.asarray(weights, on.dtype)
 

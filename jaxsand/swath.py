@@ -71,8 +71,8 @@ class SwathPush:
     | of no length | | 23% | | 22% | |
 
     and 42% for a blade 1.5 cells thick; 27% for the default blade on cells of 1 cm. After each leg but the last
-    the sand around the blade gets `sweeps` sweeps at `rate`. It works on the whole map, whatever the scene's window, and its
-    memory grows with the cells times a quarter of those along the map's diagonal.
+    the sand around the blade gets `sweeps` sweeps at `rate`. It works on the whole map, whatever the scene's window. The
+    memory of its derivative grows with the cells times a quarter of those along the map's diagonal.
     """
 
     sweeps: int = field(default=8, metadata={"static": True})
