@@ -191,7 +191,7 @@ def _sweep_out(  # noqa: PLR0915
     wanted, there = jnp.sum(density * (room - beyond)), jnp.sum(jnp.sum(put, axis=0))
     scale = wanted / jnp.where(wanted > 0, jnp.maximum(there, wanted / 2), 1)
     heap, kept, gone = _heap(job, pose, end, heaped, h, seen, open_ @ there_end, width, mu, rim)
-    put, kept = put * scale + ring + heap, kept + (wanted - there * scale)
+    put, kept = put * scale + ring + heap, kept + jnp.maximum(wanted - 2 * there, 0)
     last = taken * jnp.exp(jnp.clip((s - end) / (2 * half), -_FAR, 0))
     put = whole(job, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1)))
     if lost is not None:
