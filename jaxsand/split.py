@@ -22,7 +22,8 @@ from jax import lax
 from jaxsand.displace import Job, whole
 from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
 from jaxsand.scene import Scene
-from jaxsand.swath import ROOM, complete, hat, typical_drop, wedge
+from jaxsand.slices import hat, wedge
+from jaxsand.swath import ROOM, complete, typical_drop
 from jaxsand.tool import Grousers, Pose, Wheel, carried_area, half_chord, local, reach
 from jaxsand.window import Whole
 

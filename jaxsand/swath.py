@@ -1,19 +1,21 @@
 """A push in one go: what the blade's swath takes up is set down as berms, as a heap ahead, and behind the start.
 
-The blade pushes a heap of height H before it. What sticks out of the heap's two flanks is left behind as berms, triangles
-at repose of cross section H^2 / (2 mu) each, mu = tan(angle of repose). A blade of width w that cuts d deep is in balance
-when they take what it cuts, w d:
+The blade pushes a heap of height H before it (mound.py). What sticks out of the heap's two flanks is left behind as berms,
+triangles at repose of cross section H^2 / (2 mu) each, mu = tan(angle of repose). A blade of width w that cuts d deep is in
+balance when they take what it cuts, w d:
 
     H = sqrt(w d mu),   r = H / mu,   V_h = w H^2 / (2 mu) + (pi / 6) H^3 / mu^2,   l = V_h / (w d) = w / 2 + (pi / 6) r
 
 with r the berms' and the heap's reach and V_h the heap: a wedge across the blade and a quarter of a cone at each end. A
 heap of volume V leaves V / l to a unit of length, so that along the stroke, with intake q(s),
 
-    dV/ds = q(s) - V / l.
+    dV/ds = q(s) - a V / l,   l = w / 2 + (pi / 6) a r,
 
-Where a berm finds no room (a wall, the map's edge) the sand stays in the heap; a heap without room goes back to where it was
-taken from. Every amount is a whole number of quanta and what the cuts leave over goes to one cell, so that volume is kept as
-well as floats allow.
+a the share of the two flanks where a berm finds room. Beside walls or a closed edge a = 0: the heap keeps all, as the right
+triangle of peak sqrt(2 mu V / w) over its channel. By symmetry half a blade beside a wall is a blade twice as wide.
+Over a draining edge what stands beyond it or above its rim runs off (overflow.py). A heap without room goes back to where it
+was taken from. Every amount is a whole number of quanta and what the cuts leave over goes to one cell, so that volume is
+kept as well as floats allow.
 """
 
 import math
@@ -23,26 +25,34 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxsand.bed import Lost, lose
 from jaxsand.displace import Job, contact, settle_around, take, whole
 from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.mound import Lean, heights, held, lean, reach_of, unbounded
+from jaxsand.overflow import Rim, nothing_beyond
 from jaxsand.scene import Scene
+from jaxsand.shade import on_line, within_reach
+from jaxsand.slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
 from jaxsand.tool import Pose, coverage, local
+from jaxsand.walls import Walls
 from jaxsand.window import Whole
 
-# Shapes, fitted to SteppedPush.fine() with blades of 2 to 6 cells; lengths are shares of the reach r.
-_LAG = 1.56  # the heap carries on longer than l: it is not steady yet
-_THROW = 1.48  # how far the heap reaches ahead
-_FLARE = 0.51  # and beyond the blade's ends
-_GAP = 0.12  # where the berms' crests lie outside of the blade's ends
-_NEAR = 0.55  # how far the berms reach from there
-_INTO = 0.6  # of the berms, times r / w: what has slid back into the trench behind the blade
-_DOWN = 0.645  # how far from the blade's ends that lies
-_INNER = 1.3  # how far it is strewn
-_BEHIND = 0.256  # of the sand under the blade when it is lowered: what leaves behind it
-_ASIDE = 0.307  # and to its sides
+# Shapes, fitted to SteppedPush.fine() with blades of 2 to 16 cells; lengths are shares of the reach r, or cells.
+_LAG = 1.23  # the heap holds more than that for its outflow: it is lower at its ends
+_COARSE = 2.1  # times dx / r: and more on coarse cells
+_SLIP = 1.3  # times (r / w)^2: less when it runs round the blade's ends into a deep trench
+_FALL = 0.39  # how steeply it falls from its middle to open ends, over mu
+_AHEAD = 0.29  # cells: how far ahead of the blade it begins between open ends
+_GAP, _GAP_CELLS = 0.096, 0.35  # where the berms' crests lie outside of the blade's ends
+_NEAR = 0.48  # how far the berms reach from there
+_INTO, _DEEP = 0.78, 0.3  # 1 - exp(-_INTO - _DEEP (r / w)^3) of the berms has slid back into the trench behind the blade
+_INNER = 0.93  # how far it is strewn
+_BACK = 0.67  # of the sand under the blade when it is lowered: what leaves behind it and to its sides
+_FAR = 50.0  # times the blade's thickness: no sand comes from farther back sooner than from there
+_ACROSS = (np.arange(16) - 7.5) / 8
 ROOM = 0.25  # with less room than this part of a profile's own, sand is held back
 
 
@@ -51,10 +61,18 @@ ROOM = 0.25  # with less room than this part of a profile's own, sand is held ba
 class SwathPush:
     """Trench, berms and heap of a whole leg at once, in closed form; a fast approximation of `SteppedPush`.
 
-    For blades that cut between an eighth of a cell and a third of their width deep: there the settled map lies 20 to 40%
-    from the full push, in sum |h - h_ref| / sum |h_ref|; shallower and deeper ones lie farther. After each leg but the last
-    the sand around the blade gets `sweeps` sweeps at `rate`. It works on the whole map, whatever the scene's window, and its
-    memory grows with the cells times a quarter of those along the map's diagonal.
+    Exact in a channel that the blade fills, and over what edge it ends. In the open the settled map lies from the full push
+    (`SteppedPush.fine()`, in sum |h - h_ref| / sum |h_ref|; 8 strokes each, blades of 6 by 3 cells):
+
+    | depth / width | 1/15 | 1/4 | 1/3 | 1/2 | 1 |
+    |---|---|---|---|---|---|
+    | strokes 3.3 widths long | 28% | 22% | 25% | 40% | 73% |
+    | as long as the blade is thick | | 19% | | 28% | |
+    | of no length | | 23% | | 22% | |
+
+    and 42% for a blade 1.5 cells thick; 27% for the default blade on cells of 1 cm. After each leg but the last
+    the sand around the blade gets `sweeps` sweeps at `rate`. It works on the whole map, whatever the scene's window. The
+    memory of its derivative grows with the cells times a quarter of those along the map's diagonal.
     """
 
     sweeps: int = field(default=8, metadata={"static": True})
@@ -86,32 +104,15 @@ def _sweep_out(  # noqa: PLR0915
     """One leg: takes up the sand in the way and sets it down."""
     dx, tool = job.bed.spacing, job.tool
     half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2
-    under = coverage(tool, pose, job.x, job.y, dx)
+    first_pose, under = pose, coverage(tool, pose, job.x, job.y, dx)
     pose, length = over_the_map(scene, job, pose, length)
     cover = coverage(tool, pose, job.x, job.y, dx, length)
     sand = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
     h, taken = take(job, h, old, jnp.maximum(cover, old))
     taken = jnp.where(sand > 0, taken, 0)  # heights of whole cells throughout
     first = taken * (under / jnp.where(cover > 0, cover, 1)) if lowered else jnp.zeros_like(taken)
-
-    area = jnp.sum(cover * sand)
-    depth = jnp.maximum(jnp.sum(taken) / jnp.where(area > 0, area, 1), dx / 1000)
-    mu = typical_drop(job, (cover + 1e-6 * under) * sand) / dx
-    reach = jnp.sqrt(tool.width * depth / mu)
-    lag = _LAG * (side + math.pi / 6 * reach)
-    near, reach = jnp.maximum(_NEAR * reach, dx / 2), jnp.maximum(reach, dx / 2)
     s, n = local(pose, job.x, job.y)
-    end = half + length
-    berm = _berms(n, side, near, reach, dx) * sand
-    heap = wedge(s - end, _THROW * reach, dx) * _across(n, side, _FLARE * reach, dx) * sand
-    back_reach = jnp.maximum(jnp.sqrt(tool.thickness * depth / mu), dx / 2)
-    behind = wedge(-half - s, back_reach, dx) * _across(n, side, 0.0, dx) * sand
-    heap_width = (2 * side + _FLARE * reach) / dx
-
-    # Where the blade is lowered, some sand leaves behind it and to its sides.
-    start, back_width = jnp.sum(first), 2 * side / dx
-    back_room = jnp.sum(behind) / back_width
-    back = _BEHIND * jnp.minimum(back_room / ROOM, 1)
+    end, off = half + length, jnp.abs(n) - side
 
     # Slices of the stroke, of a spacing or more each; a cell belongs to two of them.
     least, _ = corners(scene, job, pose)
@@ -121,42 +122,139 @@ def _sweep_out(  # noqa: PLR0915
     thick = jnp.maximum(dx, (end - origin) / (count - 1))
     place = origin + slices * thick
     at = (s - origin) / thick
-    hats = hat(at.reshape(1, -1), slices)
-    room = hats @ berm.ravel() * (dx / thick)
-    onward = taken - first * (back + _ASIDE)
-    ahead = hats @ onward.ravel()
+    seen = within_reach(scene, jnp.maximum(cover, under), sand)
+
+    swept = cover * sand
+    area = jnp.sum(swept)
+    depth = jnp.maximum(jnp.sum(taken) / jnp.where(area > 0, area, 1), dx / 1000)
+    mu = typical_drop(job, (cover + 1e-6 * under) * sand) / dx
+    if isinstance(scene.walls, Walls):
+        widths = in_slices(at, count, swept) * (dx * dx / thick)
+    else:
+        along = to_slice((end - place) / thick) - to_slice((-half - place) / thick)
+        widths = 2 * side * along * on_line(scene, pose, place, side * _ACROSS, dx)
+    width = jnp.maximum(jnp.sum(widths**2) / jnp.where(jnp.sum(widths) > 0, jnp.sum(widths), 1), dx)
+    reach = jnp.sqrt(tool.width * depth / mu)
+
+    rim = None
+    if job.bed.rim is not None:
+        ground = jnp.sum(swept * jnp.where(sand > 0, h + taken, 0)) / jnp.where(area > 0, area, 1)
+        rim = Rim.of(scene, job, ground, sand, seen)
+
+    # The berms, left and right; where they find room.
+    into = 1 - jnp.exp(-_INTO - _DEEP * (reach / (2 * side)) ** 3)
+    near, inner = jnp.maximum(_NEAR * reach * jnp.sqrt(1 - into), dx / 2), _INNER * reach + dx / 2
+    part = jnp.minimum(side / inner, 1)  # how much of that there is from either end to the middle
+    left = jnp.clip(n / dx + 0.5, 0, 1)
+    outside = wedge(off - _GAP * reach - _GAP_CELLS * dx, near, dx) * (1 - into) * seen
+    inside = wedge(-off, inner, dx) * (into / (part * (2 - part))) * seen
+    if isinstance(scene.walls, Walls):
+        profiles = (left * outside, (1 - left) * outside, left * inside, (1 - left) * inside)
+        rooms = jnp.stack([in_slices(at, count, x) for x in profiles]) * (dx / thick)
+    else:
+        farther, nearer = side + _GAP * reach + _GAP_CELLS * dx + near * POINTS, side - jnp.minimum(inner, side) * POINTS
+        rooms = jnp.stack([on_line(scene, pose, place, x, dx, WEIGHTS) for x in (farther, -farther, nearer, -nearer)])
+        rooms = rooms * jnp.stack([1 - into, 1 - into, into, into])[:, None]
+    beyond = jnp.zeros_like(rooms[:2])
+    if rim is not None:
+        beyond = rim.berms(pose, place, side, reach, mu * reach, dx) * (1 - into)
+    open_ = jnp.minimum((rooms[:2] + beyond) / (ROOM * (1 - into)), 1)
+    flanks = jnp.sum(open_, axis=0) / 2
+    there_end = hat(jnp.clip((end - origin) / thick, 0, count - 1)[None, None], slices)[:, 0]
+    if rim is not None:
+        rim = replace(rim, flanks=open_ @ there_end)
+
+    # What the blade covers before it moves is taken up as it moves off, but for what it left behind and beside it.
+    ring, back = jnp.zeros_like(h), jnp.zeros_like(depth)
+    if lowered:
+        there = hat(jnp.clip(-origin / thick, 0, count - 1)[None, None], slices)[:, 0]
+        back = _BACK + (0.5 - _BACK) * (1 - jnp.max(open_ @ there))
+        ring, back = _ring(first_pose, job, under, seen, jnp.sum(first), back, mu)
+    onward = taken - first * back
+    ahead = in_slices(at, count, onward)
     ahead = ahead.at[-1].add(jnp.sum(onward * jnp.clip(at - (count - 1), 0, 1)))  # what sticks out of the last slice
-    beyond, heap_beyond = _over_rim(scene, job, pose, place, side, reach, end)
-    open_ = jnp.minimum((room + beyond) / ROOM, 1)
-    along = jnp.clip(place + thick / 2, -half, half) - jnp.clip(place - thick / 2, -half, half)
-    aside = _ASIDE * start * along / (2 * half)
-    # What the blade covers before it moves is taken up as it moves off.
     before = jnp.where(place < half, ahead, 0)
-    early = jnp.sum(before) + jnp.sum(onward * jnp.clip(-at, 0, 1)) + _ASIDE * start - jnp.sum(aside * open_)
+    early = jnp.sum(before) + jnp.sum(onward * jnp.clip(-at, 0, 1))
     ahead = ahead - before + early * hat(jnp.clip((half - origin) / thick, 0, count - 1)[None, None], slices)[:, 0]
 
     # The heap's balance, slice by slice.
     step = jnp.clip(place + thick / 2, half, end) - jnp.clip(place - thick / 2, half, end)
-    share = -jnp.expm1(-open_ * step / lag)
-
-    heaped, left = _heap_balance(ahead, share)
+    lag = _LAG * (width / 2 + math.pi / 6 * reach * flanks) * (1 + _COARSE * dx / reach)
+    lag = lag / (1 + _SLIP * (reach / tool.width) ** 2)
+    share = -jnp.expm1(-flanks * step / lag)
+    heaped, left_there = _heap_balance(ahead, share)
 
     # Setting it down.
-    left = left + aside * open_
-    density = left / jnp.where(room + beyond > 0, room + beyond, 1)
-    heap_room = jnp.sum(heap) / heap_width
-    heap_density = heaped / jnp.maximum(heap_room + heap_beyond, ROOM)
-    put = berm * (density * (dx / thick) @ hats).reshape(h.shape) + heap * (heap_density / heap_width)
-    put = put + behind * (_BEHIND * start / back_width / jnp.maximum(back_room, ROOM))
-    kept = heaped - heap_density * (heap_room + heap_beyond)
-    last = taken * (jnp.exp((jnp.minimum(s, end) - end) / lag) + 1e-6)
+    room = rooms[:2] + rooms[2:] + beyond
+    density = (left_there / jnp.where(flanks > 0, 2 * flanks, 1))[None] * open_ / jnp.where(room > 0, room, 1)
+    put = of_slices(at, left, density * (dx / thick)) * (outside + inside)
+    wanted, there = jnp.sum(density * (room - beyond)), jnp.sum(jnp.sum(put, axis=0))
+    scale = wanted / jnp.where(wanted > 0, jnp.maximum(there, wanted / 2), 1)
+    heap, kept, gone = _heap(job, pose, end, heaped, h, seen, open_ @ there_end, width, mu, rim)
+    put, kept = put * scale + ring + heap, kept + jnp.maximum(wanted - 2 * there, 0)
+    last = taken * jnp.exp(jnp.clip((s - end) / (2 * half), -_FAR, 0))
     put = whole(job, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1)))
     if lost is not None:
         every = jnp.sum(taken)
-        gone = jnp.sum(density * beyond) + heap_density * heap_beyond
+        gone = gone + jnp.sum(density * beyond)
         over = whole(job, taken * (gone / jnp.where(every > 0, every, 1)))
         lost, taken = lose(job.flow.quantum, lost, over), taken - over
     return h + complete(job, taken, put), lost
+
+
+def _ring(
+    pose: Pose, job: Job, under: jax.Array, sand: jax.Array, first: jax.Array, back: jax.Array, mu: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """What leaves to behind and beside a blade that is lowered, and its share of what lay there, at most `back`."""
+    dx, tool = job.bed.spacing, job.tool
+    half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2
+    s, n = local(pose, job.x, job.y)
+    behind = lean(-half - s, jnp.abs(n) - side, dx, sand)
+    where = Lean(behind.far, (1 - under) * jnp.clip((half - s) / dx + 0.5, 0, 1) * sand)
+    start = unbounded(back * first / mu, jnp.asarray(tool.width), jnp.ones_like(mu), dx)
+    room, _ = held(where, start, dx)
+    back = back * jnp.minimum(room * mu / jnp.where(first > 0, ROOM * back * first, 1), 1)
+    reach = reach_of(back * first / mu, start, lambda r: held(where, r, dx), dx)
+    shape = heights(where, reach, dx)
+    total = jnp.sum(shape)
+    return shape * (back * first / jnp.where(total > 0, total, 1)), back
+
+
+def _heap(
+    job: Job,
+    pose: Pose,
+    end: jax.Array,
+    volume: jax.Array,
+    h: jax.Array,
+    sand: jax.Array,
+    open_: jax.Array,
+    width: jax.Array,
+    mu: jax.Array,
+    rim: Rim | None,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The heap ahead of the blade, what finds no room there, and what runs off over the rim."""
+    dx, side = job.bed.spacing, jnp.asarray(job.tool.width) / 2
+    s, n = local(pose, job.x, job.y)
+    where = lean(s - end - _AHEAD * dx * jnp.maximum(open_[0], open_[1]), jnp.abs(n) - side, dx, sand)
+    falls = open_[0] * jnp.clip(n, 0, side) + open_[1] * jnp.clip(-n, 0, side)
+    where = Lean(where.far + _FALL * falls, where.share)
+    start = unbounded(volume / mu, width, (open_[0] + open_[1]) / 2, dx)
+    beyond = nothing_beyond if rim is None else rim.beyond(pose, end, side, start, mu, dx)
+
+    def holds(reach: jax.Array) -> tuple[jax.Array, jax.Array]:
+        (here, slope), (there, slope_there) = held(where, reach, dx), beyond(reach)
+        return here + there, slope + slope_there
+
+    placed = volume * jnp.minimum(holds(start)[0] * mu / jnp.where(volume > 0, ROOM * volume, 1), 1)
+    reach = reach_of(placed / mu, start, holds, dx)
+    gone = jnp.minimum(beyond(reach)[0] * mu, placed)
+    heap = heights(where, reach, dx)
+    total = jnp.sum(heap)
+    heap = heap * ((placed - gone) / jnp.where(total > 0, total, 1))
+    if rim is not None:
+        stays = jnp.minimum(heap, rim.room(job, h, mu))
+        heap, gone = stays, gone + jnp.sum(heap - stays)
+    return heap, volume - placed, gone
 
 
 def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
@@ -168,21 +266,17 @@ def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
     return jnp.where(total > 0, jnp.sum(weight * drop) / jnp.where(total > 0, total, 1), jnp.max(drop))
 
 
-def _berms(n: jax.Array, side: jax.Array, near: jax.Array, reach: jax.Array, dx: jax.Array) -> jax.Array:
-    """Both berms' profile across the stroke, with what has slid back into the trench."""
-    into = jnp.minimum(_INTO * reach / (2 * side), 0.8)
-    inner = jnp.minimum(_INNER * reach, side)
-    outside = wedge(jnp.abs(n) - side - _GAP * reach, near, dx) * (1 - into) / 2
-    return outside + wedge(jnp.abs(jnp.abs(n) - jnp.maximum(side - _DOWN * reach, 0)), inner, dx) * into / 2
-
-
 def complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:
     """What is put down, and on its highest cell what the cuts left over; adds up to what was taken, exactly."""
     # The counts fit their integers or wrap around; their sum is right, since what is left over is small.
     quanta = jnp.round(lax.stop_gradient(taken - put) / job.flow.quantum)
     rest = jnp.sum(quanta.astype(jnp.int64 if put.dtype == jnp.float64 else jnp.int32)).astype(put.dtype)
-    here = jnp.arange(put.size) == jnp.argmax(put.ravel())
-    return put + jnp.where(here, rest * job.flow.quantum, 0).reshape(put.shape)
+    # Its column, then its row: XLA vectorises the largest of each column, but not an argmax over the map.
+    shown = lax.stop_gradient(put)
+    column = jnp.argmax(jnp.max(shown, axis=0))
+    row = jnp.argmax(shown[:, column])
+    here = (jnp.arange(put.shape[0])[:, None] == row) & (jnp.arange(put.shape[1])[None, :] == column)
+    return put + jnp.where(here, rest * job.flow.quantum, 0)
 
 
 def _heap_balance(gains: jax.Array, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -194,42 +288,3 @@ def _heap_balance(gains: jax.Array, shares: jax.Array) -> tuple[jax.Array, jax.A
         return volume + gain - left, left
 
     return lax.scan(pass_by, jnp.zeros_like(gains[0]), (gains, shares))
-
-
-def _over_rim(
-    scene: Scene, job: Job, pose: Pose, place: jax.Array, side: jax.Array, reach: jax.Array, end: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The shares of the berms at `place` and of the heap that lie over a draining edge, smoothed over a spacing."""
-    if job.bed.rim is None:
-        return jnp.zeros_like(place), jnp.zeros_like(end)
-    rows, columns = scene.grid.shape
-
-    def out(s: jax.Array, n: jax.Array) -> jax.Array:
-        x = (pose.x + s * pose.cos - n * pose.sin) / job.bed.spacing
-        y = (pose.y + s * pose.sin + n * pose.cos) / job.bed.spacing
-        far = jnp.maximum(jnp.maximum(-x, x - columns), jnp.maximum(-y, y - rows))
-        return jnp.clip(far + 0.5, 0, 1)
-
-    off = side + reach / 3
-    heap = [out(end + _THROW * reach * a, side * b) for a in (0.1, 0.3, 0.6) for b in (-0.8, 0.0, 0.8)]
-    return (out(place, off) + out(place, -off)) / 2, jnp.mean(jnp.stack(heap))
-
-
-def hat(at: jax.Array, slices: jax.Array) -> jax.Array:
-    """How much of a place belongs to each slice [k, ...]."""
-    return jnp.maximum(1 - jnp.abs(at - slices[:, None]), 0)
-
-
-def wedge(u: jax.Array, reach: jax.Array, dx: jax.Array) -> jax.Array:
-    """The mean over a spacing around u of a wedge on [0, reach] that falls to 0; they add up to 1."""
-
-    def area(u: jax.Array) -> jax.Array:
-        part = jnp.clip(u / reach, 0, 1)
-        return part * (2 - part)
-
-    return area(u + dx / 2) - area(u - dx / 2)
-
-
-def _across(n: jax.Array, side: jax.Array, flare: jax.Array | float, dx: jax.Array) -> jax.Array:
-    """1 over the blade's width, falling to 0 over `flare` beyond its ends."""
-    return jnp.clip((side + flare - jnp.abs(n)) / (flare + dx) + 0.5 * dx / (flare + dx), 0, 1)

@@ -151,8 +151,8 @@ def test_a_push_tells_the_angle_and_the_blade(push):
     true = (math.radians(31), 0.02, 0.0075)
     for value, error, known in zip(noisy.values.values(), noisy.noise_errors.values(), true, strict=True):
         assert abs(value - known) < 4 * error
-    # A single default stroke moves too little sand for 0.2 degrees: the bound itself is about half a degree.
-    assert 0.3 < math.degrees(noisy.noise_errors["repose_angle"]) < 0.8
+    # A single default stroke moves too little sand for 0.2 degrees: the bound itself is up to a degree.
+    assert 0.3 < math.degrees(noisy.noise_errors["repose_angle"]) < 1.2
 
 
 @pytest.mark.slow

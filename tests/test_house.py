@@ -11,16 +11,16 @@ README = Path(__file__).parent.parent / "README.md"
 
 # A file imports only from floors below its own, and never from a neighbour. A folder has a floor, and floors inside.
 FLOORS = [
-    {"grid", "material", "walls", "window", "tool", "lockstep", "limit", "turns"},
+    {"grid", "material", "walls", "window", "tool", "lockstep", "limit", "turns", "slices"},
     {"scene", "loop", "fitting"},
     {"bed", "schemes", "forces", "finer"},
     {"flux", "rules", "adjoint"},
     {"sweep"},
     {"around"},
-    {"surge", "displace"},
+    {"surge", "displace", "mound"},
     {"march"},
-    {"levels", "batch", "legs"},
-    {"settling", "stencil"},
+    {"levels", "batch", "legs", "shade"},
+    {"settling", "stencil", "overflow"},
     {"resting", "frame"},
     {"rested"},
     {"blade"},

@@ -1,0 +1,89 @@
+"""What of a blade's berms and heap runs off over a draining edge.
+
+Sand can stand as high as the rim, and mu higher with the distance from it, mu = tan(angle of repose). What a blade would
+set down above that, or beyond the edge, runs off. In front of a rim above the sand it piles up as before a wall, until it
+is as high.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from jaxsand.displace import Job
+from jaxsand.mound import Holds, distance
+from jaxsand.scene import Scene
+from jaxsand.shade import between, inside, spot
+from jaxsand.tool import Pose
+
+
+@dataclass(frozen=True)
+class Rim:
+    """A draining edge: the map's lengths along x and y (m), its rim's `level` over the sand's, and how open the blade's
+    flanks are [2] in the end, where a heap may reach over it."""
+
+    size: tuple[jax.Array, jax.Array]
+    level: jax.Array
+    ground: jax.Array
+    flanks: jax.Array
+    away: jax.Array
+    seen: jax.Array
+
+    @classmethod
+    def of(cls, scene: Scene, job: Job, ground: jax.Array, sand: jax.Array, seen: jax.Array) -> "Rim":
+        assert job.bed.rim is not None
+        dx, (rows, columns) = job.bed.spacing, scene.grid.shape
+        return cls((columns * dx, rows * dx), job.bed.rim.level, ground, jnp.ones(2, sand.dtype), _from_edge(sand), seen)
+
+    def outside(self, pose: Pose, s: jax.Array, n: jax.Array, seen: jax.Array, dx: jax.Array) -> jax.Array:
+        """1 beyond the edge, smoothed over a spacing, where cells on this side are `seen`; s along and n across."""
+        x, y = spot(pose, s, n)
+        free = between(seen, x / dx - 0.5, y / dx - 0.5)
+        return jnp.clip(0.5 - inside(self.size, x, y) / dx, 0, 1) * jnp.clip(2 * free - 1, 0, 1)
+
+    def berms(
+        self, pose: Pose, place: jax.Array, side: jax.Array, reach: jax.Array, peak: jax.Array, dx: jax.Array
+    ) -> jax.Array:
+        """The share of the berms to the left and right [2, n] at `place` that runs off; of sand `peak` high what is higher
+        than the rim."""
+        off = side + reach / 3
+        out = jnp.stack([self.outside(pose, place, n, self.seen, dx) for n in (off, -off)])
+        under = jnp.stack([self.outside(pose, place, n, self.seen, dx) for n in (-side, 0 * side, side)])
+        return out * (1 - jnp.min(under, axis=0))[None] * jnp.clip(1 - (self.level - self.ground) / peak, 0, 1)
+
+    def beyond(
+        self, pose: Pose, end: jax.Array, side: jax.Array, farthest: jax.Array, mu: jax.Array, dx: jax.Array
+    ) -> Holds:
+        """What of a mound of a given reach would lie beyond the edge and above its rim (cells, over mu)."""
+        ahead, across = (jnp.arange(8) + 0.5) / 8, (jnp.arange(16) - 7.5) / 8
+        u = (farthest * ahead).astype(end.dtype)[:, None]
+        n = ((side + farthest) * across).astype(end.dtype)[None, :]
+        away = distance(u, jnp.maximum(jnp.abs(n) - side, 0))
+        weight = self.outside(pose, end + u, n, self.seen, dx) * (farthest * (side + farthest) / (64 * dx * dx))
+        weight = weight * jnp.where(jnp.abs(n) <= side, 1, jnp.where(n > 0, self.flanks[0], self.flanks[1]))
+        gap = jnp.maximum(self.level - self.ground, 0) / mu
+
+        def holds(reach: jax.Array) -> tuple[jax.Array, jax.Array]:
+            above = reach - away - gap
+            return jnp.sum(weight * jnp.maximum(above, 0)), jnp.sum(weight * (above > 0))
+
+        return holds
+
+    def room(self, job: Job, h: jax.Array, mu: jax.Array) -> jax.Array:
+        """How much higher sand can stand: up to the rim, and mu higher with the distance from it."""
+        return jnp.maximum(self.level + mu * self.away * job.bed.spacing - jnp.where(jnp.isnan(h), 0, h), 0)
+
+
+def _from_edge(sand: jax.Array) -> jax.Array:
+    """How many cells away the edge is, along rows or columns that hold sand all the way."""
+    away = jnp.full_like(sand, sum(sand.shape))
+    for axis in (0, 1):
+        for way in (sand, jnp.flip(sand, axis)):
+            cells = jnp.where(jnp.cumprod(way, axis) > 0, jnp.cumsum(jnp.ones_like(way), axis) - 0.5, sum(sand.shape))
+            away = jnp.minimum(away, cells if way is sand else jnp.flip(cells, axis))
+    return away
+
+
+def nothing_beyond(reach: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Of a closed edge: nothing runs off."""
+    return jnp.zeros_like(reach), jnp.zeros_like(reach)
