@@ -55,9 +55,8 @@ class Rim:
         self, pose: Pose, end: jax.Array, side: jax.Array, farthest: jax.Array, mu: jax.Array, dx: jax.Array
     ) -> Holds:
         """What of a mound of a given reach would lie beyond the edge and above its rim (cells, over mu)."""
-        ahead, across = (jnp.arange(8) + 0.5) / 8, (jnp.arange(16) - 7.5) / 8
-        u = (farthest * ahead).astype(end.dtype)[:, None]
-        n = ((side + farthest) * across).astype(end.dtype)[None, :]
+        ahead, across = (jnp.arange(8, dtype=end.dtype) + 0.5) / 8, (jnp.arange(16, dtype=end.dtype) - 7.5) / 8
+        u, n = (farthest * ahead)[:, None], ((side + farthest) * across)[None, :]
         away = distance(u, jnp.maximum(jnp.abs(n) - side, 0))
         weight = self.outside(pose, end + u, n, self.seen, dx) * (farthest * (side + farthest) / (64 * dx * dx))
         weight = weight * jnp.where(jnp.abs(n) <= side, 1, jnp.where(n > 0, self.flanks[0], self.flanks[1]))
@@ -65,7 +64,7 @@ class Rim:
 
         def holds(reach: jax.Array) -> tuple[jax.Array, jax.Array]:
             above = reach - away - gap
-            return jnp.sum(weight * jnp.maximum(above, 0)), jnp.sum(weight * (above > 0))
+            return jnp.sum(weight * jnp.maximum(above, 0)), jnp.sum(jnp.where(above > 0, weight, 0))
 
         return holds
 

@@ -62,6 +62,6 @@ def between(field: jax.Array, column: jax.Array, row: jax.Array) -> jax.Array:
     row, column = jnp.clip(row, 0, rows - 1), jnp.clip(column, 0, columns - 1)
     i, j = jnp.floor(row).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
     up, on = jnp.minimum(i + 1, rows - 1), jnp.minimum(j + 1, columns - 1)
-    y, x = row - i, column - j
+    y, x = row - i.astype(row.dtype), column - j.astype(column.dtype)
     low = field[i, j] * (1 - x) + field[i, on] * x
     return low * (1 - y) + (field[up, j] * (1 - x) + field[up, on] * x) * y
