@@ -313,10 +313,10 @@ def test_vmap_and_batches_equal_a_loop(push):
     slips = np.array([0.0, 0.5, -1.2], np.float32)
     loop = [rolled(push, h, s, scene(slip)) for h, s, slip in zip(maps, strokes, slips, strict=True)]
     many = quick(jax.vmap(lambda h, s, slip: js.step(scene(slip), h, s, push=push).height))(maps, strokes, slips)
-    assert np.allclose(many, loop, atol=1e-5)
+    assert np.allclose(many, loop, atol=5e-5)
     out = js.step_batch(scene(), maps, strokes, push=push, chunk=2)
     js.check(out)
-    assert np.allclose(out.height, [rolled(push, h, s) for h, s in zip(maps, strokes, strict=True)], atol=1e-5)
+    assert np.allclose(out.height, [rolled(push, h, s) for h, s in zip(maps, strokes, strict=True)], atol=5e-5)
 
 
 @both
