@@ -75,16 +75,14 @@ def push_precision(batch: int = 16, tell: Tell = lambda _: None) -> list[dict[st
         scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
         strokes = np.tile(np.asarray(random_strokes(batch), float), (3, 1))
         starts = np.concatenate(list(surfaces(scene, batch).values()))
-        limits = []
-        for name, run in (
-            ("proximal steps, sub-step 1/64", partial(_batch, push=SteppedPush(1 / 64, 32))),
-            ("proximal steps, sub-step 1/128", partial(_batch, push=SteppedPush(1 / 128, 32))),
-            ("the paper's sweeps until still, sub-step 1/64", partial(_relaxed, substep=1 / 64)),
-        ):
-            tell(f"limit: {name}")
-            limits.append((name, run(scene, starts, strokes)))
-        best = limits[1][1]
-        rows += [{"name": f"limit: {name}", **_apart(h, best, starts)} for name, h in limits if h is not best]
+        tell("limit: proximal steps, sub-steps 1/128 and 1/64")
+        best, longer = (_batch(scene, starts, strokes, push=SteppedPush(a, 32)) for a in (1 / 128, 1 / 64))
+        rows.append({"name": "limit: proximal steps, sub-step 1/64", **_apart(longer, best, starts)})
+        tell("limit: the paper's sweeps until still, sub-step 1/64, a stroke on each surface")
+        some = [0, batch, 2 * batch]
+        swept = _relaxed(scene, starts[some], strokes[some], substep=1 / 64)
+        name = "limit: the paper's sweeps until still, sub-step 1/64, a stroke on each surface"
+        rows.append({"name": name, **_apart(swept, best[some], starts[some])})
     starts32, strokes32 = starts.astype(np.float32), strokes.astype(np.float32)
     errors = []
     ways: list[SteppedPush | SwathPush] = [*_WAYS, *_FINER, SwathPush()]
