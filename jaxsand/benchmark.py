@@ -88,6 +88,7 @@ def bench(
             report["push_precision"] = pushbench.push_precision(max(1, batch // 256), tell)
             report["push_heaps"] = pushbench.heaps(tell=tell)
             report["push_by_spacing"] = pushbench.push_against_spacing(tell)
+            report["push_by_heading"] = pushbench.push_by_heading(tell)
     if what in ("plan", "all"):
         report |= complexity.planning(tell)
         report["expansions"] = expansions.rows_of_expansions(tell)

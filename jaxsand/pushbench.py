@@ -155,6 +155,28 @@ def push_against_spacing(tell: Tell = lambda _: None, batch: int = 8) -> list[di
     return [{"cells": n, "error": e, "fitted_order": order} for n, e in zip(sides, errors, strict=True)]
 
 
+def push_by_heading(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+    """One stroke of 12 cm from 0 to 45 degrees on isotropic level sand, each the mean of eight sub-cell places: the heap's
+    height before the blade is lifted and the volume dug in the end, as shares of their means over the headings."""
+    rows = []
+    for n, blade in ((32, Blade()), (64, Blade(width=0.06, thickness=0.03, depth=0.02))):
+        dx = 0.32 / n
+        tell(f"headings of a blade {blade.width / dx:.0f} cells wide")
+        scene, level = make_scene((n, n), dx, _ANGLE, neighbours="isotropic", tool=blade), jnp.zeros((n, n), jnp.float32)
+        degrees, places = np.linspace(0, 45, 5), np.random.default_rng(0).uniform(-dx / 2, dx / 2, (8, 2))
+        ways = 0.06 * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], 1)
+        middle = 0.16 + np.broadcast_to(places, (5, 8, 2))
+        paths = np.stack([middle - ways[:, None], middle + ways[:, None]], 2).reshape(40, 2, 2).astype(np.float32)
+        after, frames = jax.jit(jax.vmap(lambda path, s=scene, h=level: follow_frames(s, h, path)))(paths)
+        heap = np.asarray(frames[:, 0]).max((1, 2)).reshape(5, 8).mean(1)
+        dug = np.minimum(np.asarray(after.height), 0).sum((1, 2)).reshape(5, 8).mean(1)
+        rows += [
+            {"cells": float(blade.width / dx), "heading_deg": float(d), "heap": float(a), "dug": float(b)}
+            for d, a, b in zip(degrees, heap / heap.mean(), dug / dug.mean(), strict=True)
+        ]
+    return rows
+
+
 def heaps(
     spacings_mm: tuple[float, ...] = (10, 5, 2.5, 1.25), push: SteppedPush | None = None, tell: Tell = lambda _: None
 ) -> list[dict[str, Any]]:
