@@ -19,7 +19,8 @@ gradients of a cell, which S shortens to length.
 The weight w of a link is how open it is. A cell of which the share o is open rises by 1 / o of what it gains, so that steps
 are stable if for every f the sum over cells of (sum of f)^2 / o is at most 2 sum of f^2 / (r w); with n links to a cell, all
 open, that is r n <= 1, and for others it holds if 2 / w >= 1 / o + 1 / o', the two ends': w is their harmonic mean at most.
-Fluxes are whole quanta (bed.py).
+Isotropic sand couples two links in a gradient, which must have one weight: with each arm felt and moved by the same part a,
+1 but where a link is nearly closed, that is the lesser of the two w / a^2. Fluxes are whole quanta (bed.py).
 """
 
 import functools
@@ -38,6 +39,7 @@ from jaxsand.grid import Neighbours, links
 from jaxsand.stencil import both_ends, inner, net, outer, rises, total
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open
+_CALM = 2 / 3  # of the rate: beyond this, gradients that start from a guess overshoot, now and then without end
 _GUESSED = 0.02  # and so does a guess
 
 
@@ -126,7 +128,9 @@ def _farther_back(primals: tuple[Fluxes, jax.Array, jax.Array], back: Fluxes) ->
 
 def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
     """The heights after so many proximal steps from a guess, and the fluxes that led there."""
-    model: Links | _Gradients = _Gradients(sand, rate) if sand.neighbours == "isotropic" else Links(sand, rate)
+    model: Links | _Gradients = Links(sand, rate)
+    if sand.neighbours == "isotropic":
+        model = _Gradients(sand, _CALM * rate)
 
     def stage(_: jax.Array, flux: Fluxes) -> Fluxes:
         # All that is the same for every step goes through the barrier too: XLA would compute more beforehand, and store it.
@@ -186,11 +190,13 @@ class _Gradients:
         """The fluxes after a step, where the surface, in a halo, is `around`."""
         arms = [d * _felt(gate) for d, gate in zip(rises("isotropic", around), self.sand.gates, strict=True)]
         across, up = _both_ends(arms)
+        of_x, of_y = _both_ends([_weight(gate) for gate in self.sand.gates])
         out = []
         for n in range(4):
             i, j = n // 2, n % 2
-            zx, zy = y[2 * n] + self.rate * across[i], y[2 * n + 1] + self.rate * up[j]
-            square, least = zx * zx + zy * zy, self.rate * self.sand.drop
+            rate = self.rate * jnp.minimum(of_x[i], of_y[j])
+            zx, zy = y[2 * n] + rate * across[i], y[2 * n + 1] + rate * up[j]
+            square, least = zx * zx + zy * zy, rate * self.sand.drop
             beyond = square > least * least
             part = jnp.where(beyond, 1 - least / jnp.sqrt(jnp.where(beyond, square, 1)), 0)
             out += [zx * part, zy * part]
@@ -204,7 +210,7 @@ class _Gradients:
         column, row = jnp.zeros_like(west[:, :1]), jnp.zeros_like(west[:1])
         over_x = (jnp.concatenate([column, east], 1) + jnp.concatenate([west, column], 1)) / 4
         over_y = (jnp.concatenate([row, north], 0) + jnp.concatenate([south, row], 0)) / 4
-        moved = tuple(truncate(f * g) for f, g in zip((over_x, over_y), self.sand.gates, strict=True))
+        moved = tuple(truncate(f * _felt(g)) for f, g in zip((over_x, over_y), self.sand.gates, strict=True))
         moved = lax.optimization_barrier(moved)
         return _gained(self.sand, (*moved, *((flux[-1],) if self.sand.sides is not None else ())))
 
@@ -216,14 +222,22 @@ def _both_ends(arms: list[jax.Array]) -> tuple[tuple[jax.Array, jax.Array], tupl
 
 
 def _felt(gate: jax.Array) -> jax.Array:
+    """How far an arm of a gradient counts, a."""
     return jnp.minimum(gate / _FELT, 1)
+
+
+def _weight(gate: jax.Array) -> jax.Array:
+    """w / a^2, at most 1; what a closed link would have is of no account."""
+    return jnp.where(gate < _FELT, jnp.minimum(_FELT**2 / jnp.maximum(gate, _FELT**2), 1), gate)
 
 
 def where_open(sand: Sand, guess: Fluxes) -> Fluxes:
     """A guess as far as links are open, in whole quanta."""
+    gates = sand.gates
     if sand.neighbours == "isotropic":
-        return guess
-    gates = sand.gates if sand.sides is None else (*sand.gates, sand.open)
+        across, up = _both_ends(list(gates))
+        gates = tuple(ends[k] for n in range(4) for ends, k in ((across, n // 2), (up, n % 2)))
+    gates = gates if sand.sides is None else (*gates, sand.open)
     return tuple(nearest(jnp.where(g < _GUESSED, g / _GUESSED, 1) * f) for g, f in zip(gates, guess, strict=True))
 
 
