@@ -106,7 +106,10 @@ class SandLoss:
 
 def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     """What one stroke [P, 4] (m) each leaves of maps [P, H, W] (m) at rest; NaN where the outcome is not clean."""
-    shaped = step_batch(scene, np.asarray(maps, np.float32), np.asarray(strokes, np.float32))
+    maps = np.asarray(maps, np.float32)
+    if not len(maps):
+        return maps
+    shaped = step_batch(scene, maps, np.asarray(strokes, np.float32))
     return np.where((np.asarray(shaped.outcome) == 0)[:, None, None], np.asarray(shaped.height), np.nan)
 
 

@@ -132,7 +132,7 @@ def _sweep_out(  # noqa: PLR0915
         widths = in_slices(at, count, swept) * (dx * dx / thick)
     else:
         along = to_slice((end - place) / thick) - to_slice((-half - place) / thick)
-        widths = 2 * side * along * on_line(scene, pose, place, side * _ACROSS, dx)
+        widths = 2 * side * along * on_line(scene, pose, place, side * jnp.asarray(_ACROSS, h.dtype), dx)
     width = jnp.maximum(jnp.sum(widths**2) / jnp.where(jnp.sum(widths) > 0, jnp.sum(widths), 1), dx)
     reach = jnp.sqrt(tool.width * depth / mu)
 
@@ -152,7 +152,8 @@ def _sweep_out(  # noqa: PLR0915
         profiles = (left * outside, (1 - left) * outside, left * inside, (1 - left) * inside)
         rooms = jnp.stack([in_slices(at, count, x) for x in profiles]) * (dx / thick)
     else:
-        farther, nearer = side + _GAP * reach + _GAP_CELLS * dx + near * POINTS, side - jnp.minimum(inner, side) * POINTS
+        points = jnp.asarray(POINTS, h.dtype)
+        farther, nearer = side + _GAP * reach + _GAP_CELLS * dx + near * points, side - jnp.minimum(inner, side) * points
         rooms = jnp.stack([on_line(scene, pose, place, x, dx, WEIGHTS) for x in (farther, -farther, nearer, -nearer)])
         rooms = rooms * jnp.stack([1 - into, 1 - into, into, into])[:, None]
     beyond = jnp.zeros_like(rooms[:2])
