@@ -109,6 +109,14 @@ def over_the_map(scene: Scene, job: Job, pose: Pose, length: jax.Array) -> tuple
     return Pose(pose.x + first * pose.cos, pose.y + first * pose.sin, pose.cos, pose.sin), last - first
 
 
+def turn_between(before: Pose, after: Pose) -> jax.Array:
+    """The smaller angle from one heading to another, counter-clockwise; a reversal is half a turn to the left."""
+    sin = before.cos * after.sin - before.sin * after.cos
+    cos = before.cos * after.cos + before.sin * after.sin
+    same = (sin == 0) & (cos > 0)
+    return jnp.where(same, 0, jnp.arctan2(jnp.where(same, 0, sin), jnp.where(same, 1, cos)))
+
+
 def corners(scene: Scene, job: Job, pose: Pose) -> tuple[jax.Array, jax.Array]:
     """How far along a heading the map begins and ends (m)."""
     rows, columns = scene.grid.shape

@@ -24,7 +24,7 @@ from jax import lax
 from jaxsand.advance import Advance, Rest
 from jaxsand.block import Block, Moving, Way
 from jaxsand.displace import Job
-from jaxsand.legs import Pushed, State, along_legs, over_the_map
+from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
 from jaxsand.loop import repeat, repeat_until
 from jaxsand.lowering import Lower
 from jaxsand.resting import bring_to_rest, no_flux
@@ -118,10 +118,7 @@ def _leg(
     if before is None:
         sand = repeat(Lower(block), 1, way(pose, zero, zero), sand)
     else:
-        sin = before.cos * pose.sin - before.sin * pose.cos
-        cos = before.cos * pose.cos + before.sin * pose.sin
-        same = (sin == 0) & (cos > 0)
-        angle = jnp.where(same, 0, jnp.arctan2(jnp.where(same, 0, sin), jnp.where(same, 1, cos)))
+        angle = turn_between(before, pose)
         turn = way(Pose(pose.x, pose.y, before.cos, before.sin), zero, angle)
         bound = math.ceil(math.pi * math.hypot(*shape) / push.substep) + 1
         turning = Turn(block, substep=push.substep, sweeps=push.sweeps, rest=rest)

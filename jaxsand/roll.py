@@ -24,7 +24,7 @@ import jax.numpy as jnp
 
 from jaxsand.block import Block, Moving, Way
 from jaxsand.displace import Job
-from jaxsand.legs import Pushed, State, along_legs, over_the_map
+from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
 from jaxsand.loop import repeat, repeat_until
 from jaxsand.push import SteppedPush
 from jaxsand.resting import no_flux
@@ -63,10 +63,7 @@ def _leg(
     if before is None:
         sand = repeat(Touchdown(block), 1, _track(job, pose, zero, zero), sand)
     else:
-        sin = before.cos * pose.sin - before.sin * pose.cos
-        cos = before.cos * pose.cos + before.sin * pose.sin
-        same = (sin == 0) & (cos > 0)
-        angle = jnp.where(same, 0, jnp.arctan2(jnp.where(same, 0, sin), jnp.where(same, 1, cos)))
+        angle = turn_between(before, pose)
         turn = Turn(block, substep=push.substep, sweeps=push.sweeps)
         bound = math.ceil(math.pi * math.hypot(*shape) / push.substep) + 1
         turned = _track(job, Pose(pose.x, pose.y, before.cos, before.sin), zero, angle)

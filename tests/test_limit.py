@@ -11,7 +11,7 @@ import jaxsand as js
 from jaxsand.pushbench import heap, push_speed
 from jaxsand.task import volume_error
 
-from .conftest import ANGLE
+from .conftest import ANGLE, half_turn
 
 DX = 0.01
 
@@ -69,12 +69,7 @@ def test_the_result_goes_to_a_limit_with_the_sub_step():
 
 def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
     sand = square(n=32, tool=js.Blade(width=0.1, thickness=0.015, depth=0.0075))
-    hair = 1e-5
-    maps = []
-    for parts in (1, 2, 4):
-        headings = math.pi * np.arange(parts + 1) / parts
-        path = 0.16 + hair * np.concatenate([np.zeros((1, 2)), np.cumsum(np.c_[np.cos(headings), np.sin(headings)], 0)])
-        maps.append(np.asarray(js.follow(sand, np.zeros((32, 32)), path).height))
+    maps = [np.asarray(js.follow(sand, np.zeros((32, 32)), half_turn(parts)).height) for parts in (1, 2, 4)]
     for h in maps[1:]:
         assert np.abs(h - maps[0]).sum() < 0.02 * np.abs(maps[0]).sum()
     x, y = np.meshgrid(np.arange(32) + 0.5 - 16, np.arange(32) + 0.5 - 16)

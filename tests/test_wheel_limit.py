@@ -9,7 +9,7 @@ import pytest
 import jaxsand as js
 from jaxsand.task import volume_error
 
-from .conftest import ANGLE, MU
+from .conftest import ANGLE, MU, half_turn
 
 DX = 0.01
 
@@ -80,11 +80,7 @@ def test_shorter_sub_steps_change_ever_less():
 
 def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
     sand = js.make_scene((32, 32), DX, ANGLE, tool=js.Wheel(width=0.03, sinkage=0.012))
-    hair, maps = 1e-5, []
-    for parts in (1, 2, 4):
-        headings = math.pi * np.arange(parts + 1) / parts
-        path = 0.16 + hair * np.concatenate([np.zeros((1, 2)), np.cumsum(np.c_[np.cos(headings), np.sin(headings)], 0)])
-        maps.append(np.asarray(js.follow(sand, np.zeros((32, 32)), path).height))
+    maps = [np.asarray(js.follow(sand, np.zeros((32, 32)), half_turn(parts)).height) for parts in (1, 2, 4)]
     for h in maps[1:]:
         assert np.abs(h - maps[0]).sum() < 0.03 * np.abs(maps[0]).sum()
     x, y = np.meshgrid(np.arange(32) + 0.5 - 16, np.arange(32) + 0.5 - 16)
