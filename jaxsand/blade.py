@@ -19,11 +19,13 @@ from jax import lax
 
 from jaxsand.bed import at, truncate
 from jaxsand.displace import EIGHT, shares
-from jaxsand.flux import NARROW, Fluxes
+from jaxsand.flux import Fluxes
 from jaxsand.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, outer, seen
 
 _LEAST = 1e-4
+SLIVER = 0.01  # in an open share below this sand stands no higher than it would in this one
+_LEAVES = 0.125  # spacings: sand inside of the blade has left once it has moved so far
 Shares = dict[tuple[int, int], jax.Array]
 
 
@@ -31,13 +33,14 @@ Shares = dict[tuple[int, int], jax.Array]
 class Reach:
     """Which share of each cell a blade covers before and after it moves, and at any time on the way; the share of each
     that lies between its ends, `beside`; and `along`, how far ahead of its middle plane the cell is afterwards. All in a
-    block's halo."""
+    block's halo, and so is how far it moves, `gone` (spacings)."""
 
     before: jax.Array
     swept: jax.Array
     after: jax.Array
     beside: jax.Array
     along: jax.Array
+    gone: jax.Array
 
 
 def share(s: jax.Array, start: jax.Array, stop: jax.Array) -> jax.Array:
@@ -57,7 +60,7 @@ def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Ar
     """
     rear, front, front_after = _to(along + half), _to(along - half), _to(along - half - ahead)
     after = _to(along + half - ahead) - front_after
-    return Reach(beside * (rear - front), beside * (rear - front_after), beside * after, beside, along - ahead)
+    return Reach(beside * (rear - front), beside * (rear - front_after), beside * after, beside, along - ahead, jnp.broadcast_to(ahead, along.shape))
 
 
 def turned(
@@ -68,7 +71,7 @@ def turned(
     beside, beside_after = share(old[1], -side, side), share(new[1], -side, side)
     after = beside_after * share(new[0], -half, half)
     swept = jnp.maximum(beside * share(way * old[0], -half, half + ahead), after)
-    return Reach(beside * share(old[0], -half, half), swept, after, beside_after, new[0])
+    return Reach(beside * share(old[0], -half, half), swept, after, beside_after, new[0], ahead)
 
 
 def facing(across: jax.Array, angle: jax.Array) -> jax.Array:
@@ -78,11 +81,13 @@ def facing(across: jax.Array, angle: jax.Array) -> jax.Array:
 
 def cleared(reach: Reach, h: jax.Array, bottom: jax.Array) -> jax.Array:
     """The sand that has to leave the cells of a block, in whole quanta; ahead of the middle plane also what is still inside
-    of the blade, in cells that it all but fills."""
+    of the blade, in cells that it all but fills, at a pace that does not depend on the number of sub-steps: sand flows into
+    a sliver again, so that emptying it at once at each of them would pump."""
     before, swept, along = inner(reach.before), inner(reach.swept), inner(reach.along)
     grown = swept > before
     part = jnp.where(grown, (swept - before) / jnp.where(grown, 1 - before, 1), 0)
-    inside = jnp.where(along > 0, jnp.clip(1 - (1 - swept) / NARROW, 0, 1), 0)
+    inside = jnp.where(along > 0, jnp.clip(1 - (1 - swept) / SLIVER, 0, 1), 0)
+    inside = inside * jnp.minimum(inner(reach.gone) / _LEAVES, 1)
     return truncate(jnp.maximum(part, inside) * jnp.maximum(h - bottom, 0))
 
 

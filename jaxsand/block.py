@@ -9,7 +9,7 @@ from jax import lax
 
 from jaxsand import blade
 from jaxsand.bed import Lost, at, halo, lose
-from jaxsand.flux import NARROW, Fluxes
+from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, Places, cut, numbers, paste, places
 from jaxsand.grid import Neighbours
 from jaxsand.resting import Sand
@@ -176,7 +176,7 @@ class Block:
         """How sand stands near a blade."""
         free, gates = blade.gates(self.neighbours, reach, self.part(view.holds))
         free = inner(free)
-        return Stand(gates, free, (1 - free) / jnp.maximum(free, NARROW) * at(self.part(view.holds)))
+        return Stand(gates, free, (1 - free) / jnp.maximum(free, blade.SLIVER) * at(self.part(view.holds)))
 
     def sand(self, way: Way, view: View, clear: Stand, near: Stand) -> Sand:
         """The sand of the block around a blade, `near` which it stands as told."""
