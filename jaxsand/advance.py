@@ -20,7 +20,7 @@ from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
 from jaxsand.loop import Plain, split
 from jaxsand.rested import Rested, blank, rest_pulled, rest_taped
-from jaxsand.resting import Links, Sand, bring_to_rest, moved_on, where_open
+from jaxsand.resting import Links, Sand, bring_to_rest
 from jaxsand.stencil import inner, spread
 
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
@@ -156,10 +156,10 @@ class Advance(Step):
         room = self.block.part(view.holds if view.beyond is None else view.holds + view.beyond)
         shares = blade.onward(spread(pose.cos, near), spread(pose.sin, near), room)
         h, lost = self.block.displaced(way, view, shares, h, taken)
-        guess = tuple(f * jnp.where(moving, part, 0) for f in moved_on(flux, ahead * pose.cos, ahead * pose.sin))
         around = self.block.around(view, reach)
         sand = self.block.sand(way, view, clear, around)
-        return Ready(around, sand, rate * part, h, where_open(sand, guess)), lost
+        guess = self.block.guess(around, jnp.where(moving, part, 0), flux)
+        return Ready(around, sand, rate * part, h, guess), lost
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
         if isinstance(record, Moving):

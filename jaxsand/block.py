@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import blade
-from jaxsand.bed import Lost, at, halo, lose
+from jaxsand.bed import Lost, at, halo, lose, nearest
 from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, Places, cut, numbers, paste, places
 from jaxsand.grid import Neighbours
-from jaxsand.resting import Sand
+from jaxsand.resting import Sand, where_open
 from jaxsand.stencil import both_ends, inner, put, spread, window
 from jaxsand.tool import Pose
 
@@ -184,6 +184,12 @@ class Block:
         rim = None if way.level is None else way.level / way.quantum
         bottom = way.bottom / way.quantum
         return Sand(stand.gates, stand.open, stand.stretch, bottom, view.drop, view.sides, rim, self.neighbours)
+
+    def guess(self, near: Stand, part: jax.Array, flux: Fluxes) -> Fluxes:
+        """A part of the last fluxes, as far as links are open."""
+        whole = tuple(nearest(f * part) for f in flux)
+        there = where_open(self.neighbours, near.gates, near.open, tuple(self.part(f) for f in whole))
+        return tuple(self.put(f, g) for f, g in zip(whole, there, strict=True))
 
     def over(self, way: Way, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array] | None:
         """What lies beyond a rim near the blade, and which part of the sand above its bottom stands above the rim."""

@@ -11,10 +11,10 @@ the steps over links, proximal gradient steps
     f <- S(f + r w D (h + G f), r w m),   S(z, t) = z - clip(z, -t, t)
 
 lead there from any start, since r w is below 2 / |G|^2 (the limit of a sweep of settling). Unlike a sweep of settling,
-such a step takes back what has crossed a link too many times. That allows a good guess to begin with: around a tool the sand
-moves as it did a moment ago, a little farther ahead. So every sub-step starts from the fluxes of the last one, moved on with
-the tool, and a few steps suffice, however far the heap reaches. Isotropic sand has a flux along each of the four one-sided
-gradients of a cell, which S shortens to length.
+such a step takes back what has crossed a link too many times. That allows a good guess to begin with: around a tool that
+moves steadily the sand does too. So every sub-step starts from the fluxes of the last one, and a few steps suffice, however
+far the heap reaches. Isotropic sand has a flux along each of the four one-sided gradients of a cell, which S shortens to
+length.
 
 The weight w of a link is how open it is. A cell of which the share o is open rises by 1 / o of what it gains, so that steps
 are stable if for every f the sum over cells of (sum of f)^2 / o is at most 2 sum of f^2 / (r w); with n links to a cell, all
@@ -23,20 +23,16 @@ Isotropic sand couples two links in a gradient, which must have one weight: with
 1 but where a link is nearly closed, that is the lesser of the two w / a^2. Fluxes are whole quanta (bed.py).
 """
 
-import functools
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import linear_call
 
 from jaxsand.bed import at, halo, nearest, truncate
 from jaxsand.flux import Fluxes, ends
 from jaxsand.grid import Neighbours, links
-from jaxsand.stencil import both_ends, inner, net, outer, rises, total
+from jaxsand.stencil import both_ends, inner, net, outer, rises
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open
 _CALM = 2 / 3  # of the rate: beyond this, gradients that start from a guess overshoot, now and then without end
@@ -74,56 +70,6 @@ def no_flux(neighbours: Neighbours, drains: bool, h: jax.Array) -> Fluxes:
         around = jnp.zeros((h.shape[0] + 2, h.shape[1] + 2, *h.shape[2:]), h.dtype)
         maps = [ends(around, di, dj)[0] for di, dj, _ in links(neighbours)]
     return (*maps, jnp.zeros_like(h)) if drains else tuple(maps)
-
-
-def moved_on(flux: Fluxes, x: jax.Array, y: jax.Array) -> Fluxes:
-    """Fluxes moved by a part x, y of a cell across and up, 0 to 1."""
-    return _moved(tuple(flux), x, y)
-
-
-@jax.custom_jvp
-def _moved(flux: Fluxes, x: jax.Array, y: jax.Array) -> Fluxes:
-    return _blend(1, (x, y), flux)
-
-
-@_moved.defjvp
-def _moved_jvp(primals: Any, tangents: Any) -> tuple[Fluxes, Fluxes]:
-    (flux, x, y), (dflux, dx, dy) = primals, tangents
-    carried = linear_call(partial(_blend, 1), partial(_blend, -1), (x, y), dflux)
-    farther = linear_call(_farther, _farther_back, primals, (dx, dy))
-    return _moved(flux, x, y), tuple(a + b for a, b in zip(carried, farther, strict=True))
-
-
-def _blend(way: int, parts: tuple[jax.Array, jax.Array], flux: Fluxes) -> Fluxes:
-    """Maps moved by parts of a cell; backwards, `way` -1, the transpose of that."""
-    x, y = parts
-
-    def one(f: jax.Array) -> jax.Array:
-        u = halo(f, 0.0)
-        near = (1 - x) * f + x * at(u, 0, -way)
-        return (1 - y) * near + y * ((1 - x) * at(u, -way, 0) + x * at(u, -way, -way))
-
-    return tuple(one(f) for f in flux)
-
-
-def _slopes(f: jax.Array, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How a moved map changes with x and with y."""
-    u = halo(f, 0.0)
-    left, below, aslant = at(u, 0, -1), at(u, -1, 0), at(u, -1, -1)
-    return (left - f) * (1 - y) + (aslant - below) * y, (below - f) * (1 - x) + (aslant - left) * x
-
-
-def _farther(primals: tuple[Fluxes, jax.Array, jax.Array], by: tuple[jax.Array, jax.Array]) -> Fluxes:
-    flux, x, y = primals
-    return tuple(by[0] * across + by[1] * up for across, up in (_slopes(f, x, y) for f in flux))
-
-
-def _farther_back(primals: tuple[Fluxes, jax.Array, jax.Array], back: Fluxes) -> tuple[jax.Array, jax.Array]:
-    flux, x, y = primals
-    rows, columns = (min(n) for n in zip(*(f.shape[:2] for f in flux), strict=True))  # no sand flows beyond the others' last
-    slopes = [[(z * b)[:rows, :columns] for z in _slopes(f, x, y)] for f, b in zip(flux, back, strict=True)]
-    across, up = (functools.reduce(jnp.add, part) for part in zip(*slopes, strict=True))
-    return total(across), total(up)
 
 
 def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
@@ -231,13 +177,12 @@ def _weight(gate: jax.Array) -> jax.Array:
     return jnp.where(gate < _FELT, jnp.minimum(_FELT**2 / jnp.maximum(gate, _FELT**2), 1), gate)
 
 
-def where_open(sand: Sand, guess: Fluxes) -> Fluxes:
-    """A guess as far as links are open, in whole quanta."""
-    gates = sand.gates
-    if sand.neighbours == "isotropic":
+def where_open(neighbours: Neighbours, gates: Fluxes, open_: jax.Array, guess: Fluxes) -> Fluxes:
+    """A guess as far as links and, where a flux over a rim comes last, cells are open, in whole quanta."""
+    if neighbours == "isotropic":
         across, up = _both_ends(list(gates))
         gates = tuple(ends[k] for n in range(4) for ends, k in ((across, n // 2), (up, n % 2)))
-    gates = gates if sand.sides is None else (*gates, sand.open)
+    gates = (*gates, open_)[: len(guess)]
     return tuple(nearest(jnp.where(g < _GUESSED, g / _GUESSED, 1) * f) for g, f in zip(gates, guess, strict=True))
 
 

@@ -15,7 +15,7 @@ from jaxsand.block import First, Moving, View, pose_ahead
 from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, frame_of, shifted
 from jaxsand.loop import Plain, repeat_until
-from jaxsand.resting import bring_to_rest, moved_on, where_open
+from jaxsand.resting import bring_to_rest, where_open
 from jaxsand.tool import Pose
 from jaxsand.turning import rotated
 from jaxsand.wheel import Stand, Track
@@ -81,7 +81,7 @@ class _Moved(Step):
         """The sand once what was taken up has left the wheel, which then stands there, and all was brought to rest."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
         around, among = wheel.around(self.block, track, view, now, h)
-        guess = where_open(around, tuple(f * (among * part) for f in flux))
+        guess = where_open(around.neighbours, around.gates, around.open, tuple(f * (among * part) for f in flux))
         h, flux = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
         return h, flux, None if gone is None else gone + flux[-1]
 
@@ -147,7 +147,6 @@ class Roll(_Moved):
             h = h - taken + left
             still = k < int(self.lowered)
             part = jnp.where(still, 1, ahead / self.substep)
-            flux = moved_on(flux, ahead * frame.pose.cos, ahead * frame.pose.sin)
             flux = tuple(jnp.where(still, 0, f) for f in flux)
             shares = wheel.leaving(track, frame, now)
             h, flux, more = self.moved(track, view, shares, now, part, h, flux, left)

@@ -12,7 +12,7 @@ from jaxsand.advance import Rest, Step
 from jaxsand.bed import at
 from jaxsand.block import Moving, Way
 from jaxsand.frame import Frame
-from jaxsand.resting import bring_to_rest, where_open
+from jaxsand.resting import bring_to_rest
 from jaxsand.stencil import inner
 from jaxsand.tool import Pose
 
@@ -49,8 +49,9 @@ class Turn(Step):
         taken = jnp.where(ahead > 0, blade.cleared(reach, self.block.part(old), way.bottom / way.quantum), 0)
         face = blade.facing(at(now[1]), sign * ahead) / jnp.maximum(jnp.abs(pose.cos), jnp.abs(pose.sin))
         h, lost = self.block.displaced(way, view, blade.any_way(face * pose.cos, face * pose.sin), old, taken)
-        around = self.block.sand(way, view, self.block.clear(view), self.block.around(view, reach))
-        guess = where_open(around, tuple(f * part for f in sand.flux))
+        near = self.block.around(view, reach)
+        around = self.block.sand(way, view, self.block.clear(view), near)
+        guess = self.block.guess(near, part, sand.flux)
         new, flux = self.rest(around, way.rate * among * part, self.sweeps, h, guess)
         gone = None if lost is None else lost + flux[-1]
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))
