@@ -60,7 +60,8 @@ def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Ar
     """
     rear, front, front_after = _to(along + half), _to(along - half), _to(along - half - ahead)
     after = _to(along + half - ahead) - front_after
-    return Reach(beside * (rear - front), beside * (rear - front_after), beside * after, beside, along - ahead, jnp.broadcast_to(ahead, along.shape))
+    gone = jnp.broadcast_to(ahead, along.shape)
+    return Reach(beside * (rear - front), beside * (rear - front_after), beside * after, beside, along - ahead, gone)
 
 
 def turned(

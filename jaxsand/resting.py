@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.bed import at, halo, nearest, truncate
+from jaxsand.bed import nearest, truncate
 from jaxsand.flux import Fluxes, ends
 from jaxsand.grid import Neighbours, links
 from jaxsand.stencil import both_ends, inner, net, outer, rises
