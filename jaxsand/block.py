@@ -188,7 +188,9 @@ class Block:
     def guess(self, near: Stand, part: jax.Array, flux: Fluxes) -> Fluxes:
         """A part of the last fluxes, as far as links are open."""
         whole = tuple(nearest(f * part) for f in flux)
-        there = where_open(self.neighbours, near.gates, near.open, tuple(self.part(f) for f in whole))
+        if self.drains:
+            whole = (*whole[:-1], jnp.zeros_like(whole[-1]))
+        there = where_open(self.neighbours, near.gates, tuple(self.part(f) for f in whole))
         return tuple(self.put(f, g) for f, g in zip(whole, there, strict=True))
 
     def over(self, way: Way, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array] | None:

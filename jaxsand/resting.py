@@ -37,6 +37,7 @@ from jaxsand.stencil import both_ends, inner, net, outer, rises
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open
 _CALM = 2 / 3  # of the rate: beyond this, gradients that start from a guess overshoot, now and then without end
 _GUESSED = 0.02  # and so does a guess
+_RUNS_OFF = 5  # times as fast as over a link: nothing lies beyond a rim that it would have to share with
 
 
 @jax.tree_util.register_dataclass
@@ -177,20 +178,22 @@ def _weight(gate: jax.Array) -> jax.Array:
     return jnp.where(gate < _FELT, jnp.minimum(_FELT**2 / jnp.maximum(gate, _FELT**2), 1), gate)
 
 
-def where_open(neighbours: Neighbours, gates: Fluxes, open_: jax.Array, guess: Fluxes) -> Fluxes:
-    """A guess as far as links and, where a flux over a rim comes last, cells are open, in whole quanta."""
+def where_open(neighbours: Neighbours, gates: Fluxes, guess: Fluxes) -> Fluxes:
+    """A guess as far as links are open, in whole quanta; none of what runs off over a rim, which would not come back."""
     if neighbours == "isotropic":
         across, up = _both_ends(list(gates))
         gates = tuple(ends[k] for n in range(4) for ends, k in ((across, n // 2), (up, n % 2)))
-    gates = (*gates, open_)[: len(guess)]
-    return tuple(nearest(jnp.where(g < _GUESSED, g / _GUESSED, 1) * f) for g, f in zip(gates, guess, strict=True))
+    over = tuple(jnp.zeros_like(f) for f in guess[len(gates) :])
+    there = zip(gates, guess, strict=False)
+    return (*(nearest(jnp.where(g < _GUESSED, g / _GUESSED, 1) * f) for g, f in there), *over)
 
 
 def _over(sand: Sand, rate: jax.Array, y: jax.Array, s: jax.Array) -> jax.Array:
-    """What runs off over the rim, half a spacing beyond the outer cells."""
+    """What runs off over the rim, half a spacing beyond the outer cells: at each step nearly all that stands too high."""
     assert sand.sides is not None
     assert sand.rim is not None
-    out = jnp.maximum(y + rate * sand.open * sand.sides * (s - (sand.rim + sand.drop / 2)), 0)
+    part = jnp.minimum(_RUNS_OFF * rate, 0.9) * sand.open
+    out = jnp.maximum(y + part * (s - (sand.rim + sand.drop / 2)), 0)
     return truncate(jnp.where(sand.sides > 0, out, 0))
 
 

@@ -81,7 +81,7 @@ class _Moved(Step):
         """The sand once what was taken up has left the wheel, which then stands there, and all was brought to rest."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
         around, among = wheel.around(self.block, track, view, now, h)
-        guess = where_open(around.neighbours, around.gates, around.open, tuple(f * (among * part) for f in flux))
+        guess = where_open(around.neighbours, around.gates, tuple(f * (among * part) for f in flux))
         h, flux = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
         return h, flux, None if gone is None else gone + flux[-1]
 
