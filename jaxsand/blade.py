@@ -24,7 +24,7 @@ from jaxsand.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, outer, seen
 
 _LEAST = 1e-4
-SLIVER = 0.01  # in an open share below this sand stands no higher than it would in this one
+SLIVER = 0.02  # in an open share below this sand stands no higher than it would in this one
 _LEAVES = 0.125  # spacings: sand inside of the blade has left once it has moved so far
 Shares = dict[tuple[int, int], jax.Array]
 

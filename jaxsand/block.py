@@ -16,6 +16,7 @@ from jaxsand.resting import Sand, where_open
 from jaxsand.stencil import both_ends, inner, put, spread, window
 from jaxsand.tool import Pose
 
+SPARE = 1  # cells: the margin of a block in which sand must not move, for then none beyond would have
 _CELLS = 16_384  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache
 
 
@@ -155,14 +156,14 @@ class Block:
         return paste(view.where, lost[0], low), paste(view.where, lost[1], high)
 
     def touched(self, way: Way, frame: Frame, first: First, old: jax.Array, new: jax.Array, cover: jax.Array) -> jax.Array:
-        """How far sand moved (spacings) within two cells of the block's edge where that is not the map's; infinite where the
+        """How far sand moved (spacings) in the outermost cells of a block where its edge is not the map's; infinite where the
         blade covers a part of it, `cover` of what is near."""
         if not self.follows:
             return jnp.zeros_like(way.length)
         near: Any = False
         for axis, begin, cells in zip((1, 0), first, frame.extent(), strict=True):
             i = numbers(self.size, axis, begin)
-            near = near | ((i < 2) & (begin > 0)) | ((i >= self.size - 2) & (begin + self.size < cells))
+            near = near | ((i < SPARE) & (begin > 0)) | ((i >= self.size - SPARE) & (begin + self.size < cells))
         covered = self.put(jnp.zeros_like(old), cover) > 0
         change = jnp.where(covered, jnp.inf, jnp.abs(new - old) * (way.quantum / way.spacing))
         return lax.stop_gradient(jnp.max(jnp.where(near, change, 0), axis=(0, 1)))

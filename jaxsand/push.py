@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 
 from jaxsand.advance import Advance, Rest
-from jaxsand.block import Block, Moving, Way
+from jaxsand.block import SPARE, Block, Moving, Way
 from jaxsand.displace import Job
 from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
 from jaxsand.loop import repeat, repeat_until
@@ -134,9 +134,6 @@ def _leg(
     return h, lost, sand.edge
 
 
-_SPARE = 2  # cells: the margin in which sand must not move
-
-
 def with_near(scene: Scene) -> Scene:
     """The scene, whose window says how much of it is near its blade, if the blade's size is known."""
     if not (isinstance(scene.window, Window) and isinstance(scene.tool, Blade)):
@@ -168,7 +165,7 @@ def windows_for(scene: Scene, push: Any, least: float) -> Iterator[Scene]:
         return
     width, thickness, depth, dx = (float(x) for x in parts if x is not None)
     heap = math.sqrt(width * max(depth, dx / 2) / math.tan(float(np.min(angle))))
-    cells = (math.hypot(width, thickness) + 4 * heap) / dx + 2 * _SPARE
+    cells = (math.hypot(width, thickness) + 3.3 * heap) / dx + 2 * SPARE
     if not cells * least <= max(scene.grid.shape):
         return
     size = 2 * math.ceil(cells / 2)

@@ -37,8 +37,26 @@ Tell = Callable[[str], None]
 _ANGLE = math.radians(29)
 _STILL = 1e-4  # a slope (a tangent) at which the limit's sand counts as at rest
 _ROUNDS = 3
-_WAYS = tuple(SteppedPush(a, n) for a, n in ((1.0, 8), (0.5, 8), (0.25, 4), (0.25, 8), (0.125, 2), (0.125, 4), (0.125, 8)))
-_FINER = (SteppedPush(1 / 16, 2), SteppedPush(1 / 16, 4), SteppedPush.fine(), SteppedPush(1 / 32, 16))
+_WAYS = tuple(
+    SteppedPush(1 / a, n)
+    for a, n in (
+        (2, 4),
+        (4, 2),
+        (4, 4),
+        (8, 1),
+        (8, 2),
+        (8, 4),
+        (8, 8),
+        (16, 1),
+        (16, 2),
+        (16, 4),
+        (16, 8),
+        (32, 2),
+        (32, 4),
+        (32, 16),
+    )
+)
+_REFINED = tuple(SteppedPush(1 / a, a) for a in (4, 8, 16, 32))
 
 
 def random_strokes(batch: int, side: float = 0.32) -> jax.Array:
@@ -68,29 +86,30 @@ def push_precision(batch: int = 16, tell: Tell = lambda _: None) -> list[dict[st
 
     `error` is the mean distance from the limit over the mean change that the limit makes, after settling; `worst` the same
     of the worst map; `dug_error` and `berm_error` compare the volume below and the height above the start. The rows named
-    "limit" say how uncertain that is. `fitted_order` is that of the sub-step, at 8 sweeps and more.
+    "limit" say how uncertain that is. `fitted_order` is that of the sub-step s where 1 / s sweeps follow each.
     """
     rows: list[dict[str, Any]] = []
     with jax.enable_x64(True):
         scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
         strokes = np.tile(np.asarray(random_strokes(batch), float), (3, 1))
         starts = np.concatenate(list(surfaces(scene, batch).values()))
-        tell("limit: proximal steps, sub-steps 1/128 and 1/64")
-        best, longer = (_batch(scene, starts, strokes, push=SteppedPush(a, 32)) for a in (1 / 128, 1 / 64))
-        rows.append({"name": "limit: proximal steps, sub-step 1/64", **_apart(longer, best, starts)})
-        tell("limit: the paper's sweeps until still, sub-step 1/64, a stroke on each surface")
+        tell("limit: proximal steps, sub-steps 1/256 and 1/128")
+        best, longer = (_batch(scene, starts, strokes, push=SteppedPush(a, 64)) for a in (1 / 256, 1 / 128))
+        rows.append({"name": "limit: sub-step 1/128 from 1/256, 64 sweeps", **_apart(longer, best, starts)})
+        tell("limit: the paper's sweeps until still, a stroke on each surface")
         some = [0, batch, 2 * batch]
-        swept = _relaxed(scene, starts[some], strokes[some], substep=1 / 64)
-        name = "limit: the paper's sweeps until still, sub-step 1/64, a stroke on each surface"
-        rows.append({"name": name, **_apart(swept, best[some], starts[some])})
+        swept = _relaxed(scene, starts[some], strokes[some], substep=1 / 32)
+        steps = _batch(scene, starts[some], strokes[some], push=SteppedPush(1 / 32, 64))
+        name = "limit: the paper's sweeps until still from 64 sweeps, sub-step 1/32, a stroke on each surface"
+        rows.append({"name": name, **_apart(swept, steps, starts[some])})
     starts32, strokes32 = starts.astype(np.float32), strokes.astype(np.float32)
     errors = []
-    ways: list[SteppedPush | SwathPush] = [*_WAYS, *_FINER, SwathPush()]
+    ways: list[SteppedPush | SwathPush] = [*_WAYS, *(p for p in _REFINED if p not in _WAYS), SwathPush()]
     for push in ways:
         name = f"sub-step {push.substep:g}, {push.sweeps} sweeps" if isinstance(push, SteppedPush) else "swath"
         tell(f"push: {name}")
         found = _apart(_batch(scene, starts32, strokes32, push=push), best, starts)
-        if isinstance(push, SteppedPush) and push.sweeps >= 8:
+        if push in _REFINED:
             errors.append((push.substep, found["error"]))
         rows.append({"name": name, **found})
     sizes, distances = np.log(np.array(errors)).T
@@ -106,7 +125,11 @@ def push_speed(batch: int, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
     few = strokes[:16]
     ways: dict[str, tuple[int, Callable[[], Any]]] = {
         f"step_batch, sub-step {p.substep:g}, {p.sweeps} sweeps": (batch, partial(step_batch, scene, level, strokes, push=p))
-        for p in (SteppedPush(), SteppedPush(0.25, 4), SteppedPush(1 / 16, 2), SteppedPush(1 / 16, 4), SteppedPush.fine())
+        for p in (
+            SteppedPush(),
+            *(SteppedPush(1 / a, n) for a, n in ((4, 4), (8, 2), (16, 1), (16, 2), (16, 4))),
+            SteppedPush.fine(),
+        )
     }
     ways["step_batch, swath"] = (batch, partial(step_batch, scene, level, strokes, push=SwathPush()))
     part = max(1, batch // 4)

@@ -56,15 +56,17 @@ def test_heaps_of_many_kinds_are_triangles(case):
 
 
 def test_the_result_goes_to_a_limit_with_the_sub_step():
+    """Also where they are far shorter than the slivers of cells that a blade leaves open: these once pumped, the more the
+    shorter the sub-steps, and no limit was in sight."""
     strokes = np.array([[0.08, 0.1, 0.2, 0.17], [0.22, 0.2, 0.1, 0.12]])
     sand = js.make_scene((32, 32), DX, ANGLE, tool=js.Blade())
     maps = [
         np.asarray(js.step_batch(sand, np.zeros((2, 32, 32)), strokes, push=js.SteppedPush(a, 32)).height)
-        for a in (1 / 4, 1 / 8, 1 / 16)
+        for a in (1 / 8, 1 / 32, 1 / 128)
     ]
-    apart = [np.abs(a - b).sum() for a, b in itertools.pairwise(maps)]
-    assert apart[1] < 0.75 * apart[0]
-    assert apart[1] < 0.04 * np.abs(maps[-1]).sum()
+    apart = [np.abs(a - b).sum() / np.abs(maps[-1]).sum() for a, b in itertools.pairwise(maps)]
+    assert apart[1] < 0.6 * apart[0]
+    assert apart[1] < 0.015
 
 
 def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
@@ -104,7 +106,7 @@ def test_nothing_drains_over_a_rim_above_the_sand():
 def test_what_drains_from_a_channel_is_its_arithmetic(short):
     """A blade that fills the channel stops `short` of the edge: what does not fit between, at repose from the edge, drains.
 
-    The default push is up to 10% off: sand that it lets run off too early does not come back.
+    The default push is up to 6% off: sand that it lets run off too early does not come back.
     """
     dx, width, depth, thickness, way = 0.005, 0.015, 0.012, 0.02, 0.15
     columns = 64
@@ -115,7 +117,7 @@ def test_what_drains_from_a_channel_is_its_arithmetic(short):
     face = columns * dx - short - thickness / 2
     stroke = [face - way, 2.5 * dx, face, 2.5 * dx]
     heap = depth * (way + thickness / 2 + min(short, 0)) - math.tan(ANGLE) * max(short, 0) ** 2 / 2
-    for push, off in ((js.SteppedPush(), 0.1), (js.SteppedPush(1 / 8, 32), 0.01)):
+    for push, off in ((js.SteppedPush(), 0.06), (js.SteppedPush(1 / 8, 32), 0.01)):
         out = js.act(sand, np.zeros((5, columns)), stroke, push=push)
         assert float(out.drained) == pytest.approx(width * heap, rel=off)
 

@@ -62,7 +62,7 @@ __all__ = [
     "pool_of",
 ]
 
-_SHAPE, _SPACING, _WINDOW = (32, 32), 0.01, (16, 16)
+_SHAPE, _SPACING, _WINDOW = (32, 32), 0.01, (12, 12)
 
 
 def make(name: str, **options: Any) -> tuple[Any, Any]:
@@ -80,7 +80,7 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
     "multi-stroke": the fields of `MultiStroke`; `goals` a `RandomStrokes()`, glyphs {name: strokes of the unit square}, or
     maps [G, H, W] (m), such as `task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no
     berms); `starts` a `Level()` or `Rough(relief)`; a `seed` for both; `scene` and `limit`. The default scene is the
-    glyphs', and computes a window of 14 x 14 cells around the blade while it is down.
+    glyphs', and computes a window of 12 x 12 cells around the blade while it is down.
 
     Raises:
       ValueError: for a name or an option that there is not.
