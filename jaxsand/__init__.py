@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
+    "AsNeeded": "window",
     "Blade": "tool",
     "Blurred": "optimise",
     "Calibration": "fitting",

@@ -17,7 +17,7 @@ from jaxsand.stencil import both_ends, inner, put, spread, window
 from jaxsand.tool import Pose
 
 SPARE = 1  # cells: the margin of a block in which sand must not move, for then none beyond would have
-_CELLS = 16_384  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache
+_CELLS = 8_192  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache
 
 
 @jax.tree_util.register_dataclass
@@ -156,8 +156,8 @@ class Block:
         return paste(view.where, lost[0], low), paste(view.where, lost[1], high)
 
     def touched(self, way: Way, frame: Frame, first: First, old: jax.Array, new: jax.Array, cover: jax.Array) -> jax.Array:
-        """How far sand moved (spacings) in the outermost cells of a block where its edge is not the map's; infinite where the
-        blade covers a part of it, `cover` of what is near."""
+        """How far sand moved (spacings) in the outermost cells of a block where its edge is not the map's; infinite where
+        the blade covers a part of it, `cover` of what is near."""
         if not self.follows:
             return jnp.zeros_like(way.length)
         near: Any = False

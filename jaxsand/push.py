@@ -31,7 +31,7 @@ from jaxsand.resting import bring_to_rest, no_flux
 from jaxsand.scene import Scene, concrete
 from jaxsand.tool import Blade, Pose
 from jaxsand.turning import Turn
-from jaxsand.window import Whole, Window
+from jaxsand.window import AsNeeded, Window
 
 
 @jax.tree_util.register_dataclass
@@ -154,10 +154,13 @@ def _far(width: Any, thickness: Any) -> Any:
     return ((width + 1) ** 2 + (thickness + 1) ** 2) ** 0.5 / 2 + 1
 
 
-def windows_for(scene: Scene, push: Any, least: float) -> Iterator[Scene]:
-    """The scene with windows around its blade, each twice as wide as the one before, as long as the map is `least` times as
-    wide; sand that reaches a window's edge asks for the next."""
-    if not (isinstance(scene.window, Whole) and isinstance(scene.tool, Blade) and isinstance(push, SteppedPush)):
+_LEAST = 1.5  # times a window's width: the map's, for the window to save work
+
+
+def windows_for(scene: Scene, push: Any, times: float = 1) -> Iterator[Scene]:
+    """The scene with windows around its blade, the first so many times as wide as a stroke asks for and each twice as wide
+    as the one before, as long as that saves work; sand that reaches a window's edge asks for the next."""
+    if not (isinstance(scene.window, AsNeeded) and isinstance(scene.tool, Blade) and isinstance(push, SteppedPush)):
         return
     parts = [concrete(x) for x in (scene.tool.width, scene.tool.thickness, scene.tool.depth, scene.grid.spacing)]
     angle = concrete(scene.material.repose_angle)
@@ -165,11 +168,11 @@ def windows_for(scene: Scene, push: Any, least: float) -> Iterator[Scene]:
         return
     width, thickness, depth, dx = (float(x) for x in parts if x is not None)
     heap = math.sqrt(width * max(depth, dx / 2) / math.tan(float(np.min(angle))))
-    cells = (math.hypot(width, thickness) + 3.3 * heap) / dx + 2 * SPARE
-    if not cells * least <= max(scene.grid.shape):
+    cells = times * (math.hypot(width, thickness) + 3.3 * heap) / dx + 2 * SPARE
+    if not cells * _LEAST <= max(scene.grid.shape):
         return
     size = 2 * math.ceil(cells / 2)
-    while size * least <= max(scene.grid.shape):
+    while size * _LEAST <= max(scene.grid.shape):
         rows, columns = scene.grid.shape
         window = Window((min(size, rows), min(size, columns)), jnp.asarray(1e-3, jnp.result_type(scene.grid.spacing)))
         yield with_near(replace(scene, window=window))

@@ -26,7 +26,6 @@ from jaxsand.window import Whole
 
 Array = jax.typing.ArrayLike
 Loss = Callable[..., jax.Array]
-_LEAST = 1.5  # times a window's width: the map's, for the window to save work
 _GRADIENTS = 32  # the most that are pulled back together, on a CPU
 
 
@@ -104,7 +103,7 @@ def _batch(
         batch = jax.tree.map(lambda x: x[who], (height, stroke, args))
         return in_groups(partial(program, scene, rules), batch, _lengths, chunk)
 
-    scenes = [*windows_for(scene, rules[0], _LEAST), scene]
+    scenes = [*windows_for(scene, rules[0]), scene]
     return in_turns([partial(run, one) for one in scenes], _flagged)
 
 

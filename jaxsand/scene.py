@@ -12,7 +12,7 @@ from jaxsand.grid import Grid, Neighbours
 from jaxsand.material import DRY_SAND, Material
 from jaxsand.tool import Blade, Grousers, NoTool, Smooth, Wheel
 from jaxsand.walls import Closed, Draining, Open, Walls
-from jaxsand.window import Whole, Window
+from jaxsand.window import AsNeeded, Whole, Window
 
 
 @jax.tree_util.register_dataclass
@@ -24,7 +24,7 @@ class Scene:
     material: Material = DRY_SAND
     walls: Open | Walls = field(default_factory=Open)
     edge: Closed | Draining = field(default_factory=Closed)
-    window: Whole | Window = field(default_factory=Whole)
+    window: AsNeeded | Whole | Window = field(default_factory=AsNeeded)
     tool: NoTool | Blade | Wheel = field(default_factory=NoTool)
 
 
@@ -37,7 +37,7 @@ def make_scene(
     tool: NoTool | Blade | Wheel | None = None,
     walls: Open | Walls | None = None,
     edge: Closed | Draining | None = None,
-    window: Whole | Window | None = None,
+    window: AsNeeded | Whole | Window | None = None,
 ) -> Scene:
     """A checked scene.
 
@@ -62,7 +62,7 @@ def make_scene(
         Material(_number(repose_angle)),
         Open() if walls is None else _as_walls(walls),
         Closed() if edge is None else edge,
-        Whole() if window is None else window,
+        AsNeeded() if window is None else window,
         NoTool() if tool is None else tool,
     )
     _check_walls(scene.walls, shape)
@@ -227,8 +227,8 @@ def check_window(window: Any, shape: tuple[int, int]) -> None:
         tolerance = concrete(window.tolerance)
         if tolerance is not None and not np.all(tolerance >= 0):
             raise ValueError(f"window.tolerance: got {window.tolerance!r}; give 0 or a small positive number of spacings")
-    elif not isinstance(window, Whole):
-        raise ValueError(f"window: got {window!r}; give Whole() or Window(size)")
+    elif not isinstance(window, AsNeeded | Whole):
+        raise ValueError(f"window: got {window!r}; give AsNeeded(), Whole() or Window(size)")
 
 
 def _check_tool(tool: Any, grid: Grid) -> None:

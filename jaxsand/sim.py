@@ -1,5 +1,6 @@
 """The simulator: a tool acts, the sand settles."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -30,6 +31,9 @@ _PUSHES: dict[tuple[type, type], Any] = {
 }
 
 
+_SURE = 1.5  # times the width of a window that a stroke asks for, where there is no second try
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shaped(Settled):
@@ -44,7 +48,8 @@ def act(scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike
     The map is not settled afterwards; see `step`.
     """
     scene, height, rules = ready(scene, height, push, None, None)
-    return _act(scene, height, _stroke(stroke, height.dtype), rules)
+    path = _stroke(stroke, height.dtype)
+    return _as_needed(lambda scene: _act(scene, height, path, rules), scene, rules[0], (height, path))
 
 
 def step(
@@ -89,17 +94,11 @@ def follow(
     reversal is half a turn, to the left. A leg of no length keeps the heading. What a turn leaves does not depend on how it
     is divided into parts.
 
-    On a map much wider than the blade's heap only a window around the blade is computed, as wide as the sand asks for (not
-    inside `jit`, `grad` or `vmap`, where the scene's own window holds).
+    On a map wider than a blade's heap only a window around the blade is computed; see `AsNeeded`.
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
-    if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, height, path, rules))):
-        for part in windows_for(scene, rules[0], 4):
-            out = _follow(part, height, path, rules)[0]
-            if not int(out.outcome) & Outcome.WINDOW_EDGE:
-                return out
-    return _follow(scene, height, path, rules)[0]
+    return _as_needed(lambda scene: _follow(scene, height, path, rules)[0], scene, rules[0], (height, path))
 
 
 def follow_frames(
@@ -113,7 +112,8 @@ def follow_frames(
 ) -> tuple[Shaped, jax.Array]:
     """`follow`, and the map after each leg, before the tool is lifted: [n - 1, H, W] (m)."""
     scene, height, rules = ready(scene, height, push, scheme, stop)
-    return _follow(scene, height, _path(path, height.dtype), rules, record=_itself)
+    path = _path(path, height.dtype)
+    return _as_needed(lambda scene: _follow(scene, height, path, rules, record=_itself), scene, rules[0], (height, path))
 
 
 def rollout(
@@ -130,7 +130,19 @@ def rollout(
     strokes = as_array("strokes", strokes, height.dtype)
     if strokes.ndim != 2 or strokes.shape[1] != 4:
         raise ValueError(f"strokes: got shape {list(strokes.shape)}; give [n, 4], a row x0, y0, x1, y1 for each push")
-    return _rollout(scene, height, strokes, rules)
+    return _as_needed(lambda scene: _rollout(scene, height, strokes, rules), scene, rules[0], (height, strokes))
+
+
+def _as_needed(run: Callable[[Scene], Any], scene: Scene, push: Push, arrays: Any) -> Any:
+    """What a run in a window around the blade gives, as wide as the sand asks for; traced, in one that is likely enough."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, push, arrays))):
+        return run(next(windows_for(scene, push, _SURE), scene))
+    for part in windows_for(scene, push):
+        out = run(part)
+        outcome = (out[0] if isinstance(out, tuple) else out).outcome
+        if not np.any(np.asarray(outcome) & Outcome.WINDOW_EDGE):
+            return out
+    return run(scene)
 
 
 class OutcomeError(RuntimeError):
@@ -198,8 +210,12 @@ def ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple
         check_whole("push.sweeps", push.sweeps, 0)
         check_rate(scene, "push.rate", push.rate)
     scheme, stop = check_rule(scene, scheme, stop)
-    scene, height = fit(with_near(scene), height)
-    return scene, height, cast((push, scheme, stop), height.dtype)
+    fitted, height = fit(with_near(scene), height)
+    if isinstance(
+        fitted.grid.spacing, jax.core.Tracer
+    ):  # under jit: what is cast to the height's dtype is no number any more
+        fitted, _ = fit(next(windows_for(scene, push, _SURE), with_near(scene)), height)
+    return fitted, height, cast((push, scheme, stop), height.dtype)
 
 
 def _stroke(stroke: Any, dtype: Any) -> jax.Array:

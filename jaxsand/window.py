@@ -10,8 +10,20 @@ from jax import lax
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class AsNeeded:
+    """Where a blade's sand moves, as far as the blade's size tells (the default).
+
+    A stepped push of a blade computes a window around it, and a larger one, up to the whole map, where sand reaches its
+    edge. Inside of `jit`, `grad` or `vmap`, where what happens is not known beforehand, the window is half as wide again,
+    and the outcome says WINDOW_EDGE if it was too small; give `Window(size)` or `Whole()` then. All else is computed
+    everywhere.
+    """
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Whole:
-    """Everywhere (neutral)."""
+    """Everywhere."""
 
 
 @jax.tree_util.register_dataclass
@@ -21,9 +33,9 @@ class Window:
     what is too steep (see there).
 
     Under a tool the map must be still when the tool comes down: no slope above repose by more than `tolerance`. If that does
-    not hold, or a cell within two cells of the block's edge (where that is not the map's) moves by more than `tolerance`
-    spacings while the tool advances by one sub-step, the outcome says WINDOW_EDGE: the result may then differ from that of
-    `Whole`. With tolerance 0 and no such outcome the two are equal up to the rounding of single operations.
+    not hold, or an outermost cell of the block (where its edge is not the map's) moves by more than `tolerance` spacings
+    while the tool advances by a spacing, the outcome says WINDOW_EDGE: the result may then differ from that of `Whole`.
+    With tolerance 0 and no such outcome the two are equal up to the rounding of single operations.
     """
 
     size: tuple[int, int] = field(metadata={"static": True})
