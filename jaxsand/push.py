@@ -46,7 +46,7 @@ class SteppedPush:
 
     substep: float = field(default=0.125, metadata={"static": True})
     sweeps: int = field(default=4, metadata={"static": True})
-    rate: jax.Array | float = 0.18
+    rate: jax.Array | float = 0.2
 
     @classmethod
     def fine(cls) -> "SteppedPush":

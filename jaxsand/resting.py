@@ -35,7 +35,7 @@ from jaxsand.grid import Neighbours, links
 from jaxsand.stencil import both_ends, inner, net, outer, rises
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open
-_CALM = 2 / 3  # of the rate: beyond this, gradients that start from a guess overshoot, now and then without end
+_CALM = 0.6  # of the rate: beyond this, gradients that start from a guess overshoot, now and then without end
 _GUESSED = 0.07  # and so does a guess: the less, the closer to the limit, and the more a stroke moved by a hair changes
 _RUNS_OFF = 5  # times as fast as over a link: nothing lies beyond a rim that it would have to share with
 

@@ -24,11 +24,11 @@ def sand(window=None, **parts):
 
 
 @pytest.mark.parametrize(
-    "sizes", [((8, 8), (56, 56)), pytest.param(((8, 8), (28, 28), (56, 56), (72, 80)), marks=pytest.mark.slow)]
+    "sizes", [((6, 6), (56, 56)), pytest.param(((6, 6), (28, 28), (56, 56), (72, 80)), marks=pytest.mark.slow)]
 )
 def test_equal_or_flagged(sizes):
     strokes = jnp.asarray(np.random.default_rng(0).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (12, 4)))
-    whole = jax.vmap(lambda s: js.act(sand(), jnp.zeros(SHAPE), s).height)(strokes)
+    whole = jax.vmap(lambda s: js.act(sand(js.Whole()), jnp.zeros(SHAPE), s).height)(strokes)
     exact = {}
     for size in sizes:
         window = js.Window(size, tolerance=0.0)
@@ -37,15 +37,15 @@ def test_equal_or_flagged(sizes):
         flagged = [bool(o & js.Outcome.WINDOW_EDGE) for o in out.outcome]
         assert all(s or f for s, f in zip(same, flagged, strict=True))
         exact[size] = (sum(same), sum(flagged))
-    assert exact[8, 8][1] >= 11  # too small: said
-    assert exact[8, 8][0] < 6
+    assert exact[6, 6][1] >= 11  # too small: said
+    assert exact[6, 6][0] < 6
     for size in {(56, 56), (72, 80)} & exact.keys():  # large enough: the same maps
         assert exact[size] == (12, 0)
 
 
 def test_the_default_tolerance_keeps_the_difference_small():
     strokes = jnp.asarray(np.random.default_rng(1).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (8, 4)))
-    whole = jax.vmap(lambda s: js.step(sand(), jnp.zeros(SHAPE), s).height)(strokes)
+    whole = jax.vmap(lambda s: js.step(sand(js.Whole()), jnp.zeros(SHAPE), s).height)(strokes)
     out = jax.vmap(lambda s: js.step(sand(js.Window((36, 36))), jnp.zeros(SHAPE), s))(strokes)
     clean = np.asarray(out.outcome) == 0
     assert clean.any()
@@ -73,7 +73,7 @@ def test_a_window_at_the_map_edge_with_everything_in_it():
         scene = js.make_scene(SHAPE, DX, angle, tool=js.Blade(), window=window, **parts)
         return js.act(scene, np.zeros(SHAPE), stroke)
 
-    whole, window = run(None), run(js.Window((60, 60), tolerance=0.0))
+    whole, window = run(js.Whole()), run(js.Window((60, 60), tolerance=0.0))
     assert int(window.outcome) == 0
     assert np.abs(whole.height - window.height).max() < ROUNDING
     assert float(whole.drained) == pytest.approx(float(window.drained), rel=1e-9, abs=1e-15)
