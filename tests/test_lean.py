@@ -30,7 +30,7 @@ def test_what_is_left_out_costs_nothing():
 
 def test_a_scene_without_a_tool_or_window_holds_no_code_for_them():
     bare = size(js.make_scene(SHAPE, 0.01))
-    blade = size(js.make_scene(SHAPE, 0.01, tool=js.Blade()))
+    blade = size(js.make_scene(SHAPE, 0.01, tool=js.Blade(), window=js.Whole()))
     window = size(js.make_scene(SHAPE, 0.01, tool=js.Blade(), window=js.Window((16, 16))))
     assert blade > 3 * bare
     assert window > blade
@@ -44,7 +44,7 @@ def test_a_window_costs_its_share_of_a_sub_step():
         program = jax.jit(lambda h: js.act(scene, h, jnp.zeros(4, "float32")).height)
         return program.lower(jnp.zeros((128, 128), "float32")).compile().cost_analysis()["flops"]
 
-    assert push(js.Window((16, 16))) < 0.2 * push(None)
+    assert push(js.Window((16, 16))) < 0.2 * push(js.Whole())
 
 
 def test_six_calls_of_two_kinds_and_three_angles_trace_twice():
