@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.bed import Bed, halo
-from jaxsand.grid import links
+from jaxsand.scene.grid import links
 
 Lattice = tuple[jax.Array, ...]  # a map [H + 1, W + 1] for each direction of links
 _CORNERS = {(0, 1): (0, 1), (1, 0): (0, 2), (1, 1): (0, 3), (1, -1): (1, 2)}

@@ -17,7 +17,7 @@ from jaxsand.bed import at, halo, largest, prepare, quantum
 from jaxsand.flux import Nothing
 from jaxsand.plain import settle_numpy
 from jaxsand.rules import UntilStill
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.schemes import Relaxation
 from jaxsand.settling import relax, settle, settle_batch
 from jaxsand.sweep import Flow, sweep

@@ -17,8 +17,8 @@ from jax import lax
 from jaxsand import adjoint
 from jaxsand.bed import Bed, Lost, at, halo
 from jaxsand.flux import Around, flows
-from jaxsand.grid import links
 from jaxsand.loop import Plain, repeat, split
+from jaxsand.scene.grid import links
 from jaxsand.sweep import Flow, counted, pass_over
 
 

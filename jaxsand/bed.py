@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.grid import Neighbours
-from jaxsand.scene import Scene
-from jaxsand.walls import Draining, Walls
+from jaxsand.scene.boundaries import Draining, Walls
+from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.scene import Scene
 
 Lost = tuple[jax.Array, jax.Array] | None
 

@@ -38,11 +38,11 @@ from jaxsand.files import as_table
 from jaxsand.letterbench import bench_letters
 from jaxsand.plain import compile_c, settle_numpy
 from jaxsand.rules import Sweeps, UntilStill
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.schemes import Relaxation, SuperTimeStepping
 from jaxsand.settling import Settled, settle, settle_batch
 from jaxsand.sim import act
-from jaxsand.tool import Blade
 
 Tell = Callable[[str], None]
 _CELLS = 32

@@ -20,7 +20,7 @@ from jax import lax
 from jaxsand.bed import at, truncate
 from jaxsand.displace import EIGHT, shares
 from jaxsand.flux import Fluxes
-from jaxsand.grid import Neighbours
+from jaxsand.scene.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, outer, seen
 
 _LEAST = 1e-4

@@ -11,10 +11,10 @@ from jaxsand import blade
 from jaxsand.bed import Lost, at, halo, lose, nearest
 from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, Places, cut, numbers, paste, places
-from jaxsand.grid import Neighbours
 from jaxsand.resting import Sand, where_open
+from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.tools import Pose
 from jaxsand.stencil import both_ends, inner, put, spread, window
-from jaxsand.tool import Pose
 
 SPARE = 1  # cells: the margin of a block in which sand must not move, for then none beyond would have
 _CELLS = 8_192  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache

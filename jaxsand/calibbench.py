@@ -10,12 +10,12 @@ import numpy as np
 
 from jaxsand.calibration import Trial, calibrate
 from jaxsand.finer import OneGrid, TwoGrids
-from jaxsand.grid import Neighbours
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.settling import settle
 from jaxsand.sim import Push, step
 from jaxsand.swath import SwathPush
-from jaxsand.tool import Blade
 
 NOISE = 6e-4
 """Standard deviation (m) of the white noise in the heights after."""

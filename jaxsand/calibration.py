@@ -13,13 +13,13 @@ import numpy as np
 from jaxsand.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
 from jaxsand.limit import Reference
-from jaxsand.material import Material
 from jaxsand.rules import Stop, check_rule, check_whole
-from jaxsand.scene import Scene, as_array, concrete, fit
+from jaxsand.scene.material import Material
+from jaxsand.scene.scene import Scene, as_array, concrete, fit
+from jaxsand.scene.tools import NoTool
 from jaxsand.schemes import Scheme
 from jaxsand.settling import settle
 from jaxsand.sim import Push, check_push, rollout
-from jaxsand.tool import NoTool
 
 Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"

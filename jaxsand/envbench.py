@@ -19,9 +19,9 @@ from jax.sharding import PartitionSpec as P
 from jaxsand.batch import wide_vectors
 from jaxsand.env import LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.rules import Sweeps, UntilStill
+from jaxsand.scene.window import Whole
 from jaxsand.strokeloss import pushed
 from jaxsand.swath import SwathPush
-from jaxsand.window import Whole
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]

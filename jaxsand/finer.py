@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.grid import Grid
-from jaxsand.scene import Scene
-from jaxsand.walls import Walls
-from jaxsand.window import Window
+from jaxsand.scene.boundaries import Walls
+from jaxsand.scene.grid import Grid
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.window import Window
 
 
 @dataclass(frozen=True)

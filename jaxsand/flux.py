@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.bed import Bed, Rim, at, halo
-from jaxsand.grid import Link, Neighbours, links
+from jaxsand.scene.grid import Link, Neighbours, links
 
 Fluxes = tuple[jax.Array, ...]
 NARROW = 0.05  # in an open share below this sand stands no higher than it would in this one

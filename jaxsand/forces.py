@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.grid import centres
-from jaxsand.scene import Scene, cast, concrete, fit
-from jaxsand.tool import Blade, Pose, coverage
+from jaxsand.scene.grid import centres
+from jaxsand.scene.scene import Scene, cast, concrete, fit
+from jaxsand.scene.tools import Blade, Pose, coverage
 
 Scalar = jax.Array | float
 _TINY = float(np.finfo(np.float32).tiny)

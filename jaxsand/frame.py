@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand.tool import Pose
+from jaxsand.scene.tools import Pose
 
 Block = Any
 

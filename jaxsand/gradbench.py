@@ -23,10 +23,10 @@ from jaxsand.gradcheck import (
 )
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Stop, Sweeps, UntilStill
-from jaxsand.scene import cast, make_scene
+from jaxsand.scene.scene import cast, make_scene
+from jaxsand.scene.tools import Blade
+from jaxsand.scene.window import Window
 from jaxsand.strokeloss import GRADIENT, SandLoss
-from jaxsand.tool import Blade
-from jaxsand.window import Window
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]

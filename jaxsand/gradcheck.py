@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.grid import Neighbours
 from jaxsand.rules import Stop, Sweeps
-from jaxsand.scene import cast, make_scene
+from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.scene import cast, make_scene
+from jaxsand.scene.tools import Blade
+from jaxsand.scene.window import Window
 from jaxsand.settling import settle
 from jaxsand.sim import act, step
-from jaxsand.tool import Blade
-from jaxsand.window import Window
 
 Inputs = tuple[Any, Any, Any]
 """Heights [B, H, W] (m), strokes [B, 4] (m) and angles of repose [B] (rad)."""

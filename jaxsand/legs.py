@@ -11,13 +11,13 @@ from jax import lax
 from jaxsand.bed import Lost, halo, largest, mark, nothing_lost, prepare, quantum, sound, spoiled, unmark, volume_lost
 from jaxsand.displace import Job
 from jaxsand.flux import worst_excess
-from jaxsand.grid import centres
 from jaxsand.rules import Outcome, said
-from jaxsand.scene import Scene
+from jaxsand.scene.grid import centres
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import NoTool, Pose, extent, local, lowest, reach
+from jaxsand.scene.tools import usable as makes_sense
+from jaxsand.scene.window import Window
 from jaxsand.sweep import Flow
-from jaxsand.tool import NoTool, Pose, extent, local, lowest, reach
-from jaxsand.tool import usable as makes_sense
-from jaxsand.window import Window
 
 
 @jax.tree_util.register_dataclass

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 from jaxsand.strokeloss import SandLoss, pushed
 
 _ASIDE = (0.25, 0.1)  # cells: so far the numbers of a plan are moved, to see what that does

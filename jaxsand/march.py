@@ -12,8 +12,8 @@ from jax import lax
 
 from jaxsand.bed import Bed, Lost, grain, truncate
 from jaxsand.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
-from jaxsand.grid import links
 from jaxsand.loop import Plain, Step, repeat, repeat_until
+from jaxsand.scene.grid import links
 from jaxsand.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.surge import Surges
 from jaxsand.sweep import Flow, Sweep, apply

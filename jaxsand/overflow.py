@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from jaxsand.displace import Job
 from jaxsand.mound import Holds, distance
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Pose
 from jaxsand.shade import between, inside, spot
-from jaxsand.tool import Pose
 
 
 @dataclass(frozen=True)

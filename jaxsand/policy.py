@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from jaxsand.scene import Scene, blade_of
+from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.strokenet import StrokeNet, judge, likeliest, symmetric
 
 SIDE = 32

@@ -28,10 +28,10 @@ from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
 from jaxsand.loop import repeat, repeat_until
 from jaxsand.lowering import Lower
 from jaxsand.resting import bring_to_rest, no_flux
-from jaxsand.scene import Scene, concrete
-from jaxsand.tool import Blade, Pose
+from jaxsand.scene.scene import Scene, concrete
+from jaxsand.scene.tools import Blade, Pose
+from jaxsand.scene.window import AsNeeded, Window
 from jaxsand.turning import Turn
-from jaxsand.window import AsNeeded, Window
 
 
 @jax.tree_util.register_dataclass

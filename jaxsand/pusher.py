@@ -18,11 +18,11 @@ from jaxsand.batch import in_groups, in_turns, wide_vectors
 from jaxsand.legs import Pushed
 from jaxsand.push import windows_for
 from jaxsand.rules import Outcome, Stop, as_batch, check_chunk
-from jaxsand.scene import Scene, as_array
+from jaxsand.scene.scene import Scene, as_array
+from jaxsand.scene.window import Whole
 from jaxsand.schemes import Scheme
 from jaxsand.settling import relax_batch
 from jaxsand.sim import Push, Rules, Shaped, lifted, ready, step, way_of
-from jaxsand.window import Whole
 
 Array = jax.typing.ArrayLike
 Loss = Callable[..., jax.Array]

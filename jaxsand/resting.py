@@ -31,7 +31,7 @@ from jax import lax
 
 from jaxsand.bed import nearest, truncate
 from jaxsand.flux import Fluxes, ends
-from jaxsand.grid import Neighbours, links
+from jaxsand.scene.grid import Neighbours, links
 from jaxsand.stencil import both_ends, inner, net, outer, rises
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open

@@ -29,10 +29,10 @@ from jaxsand.loop import repeat, repeat_until
 from jaxsand.push import SteppedPush
 from jaxsand.resting import no_flux
 from jaxsand.rolling import Roll, Touchdown, Turn
-from jaxsand.scene import Scene
-from jaxsand.tool import Pose, Smooth, carried_area, half_chord
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Pose, Smooth, carried_area, half_chord
+from jaxsand.scene.window import Window
 from jaxsand.wheel import Track
-from jaxsand.window import Window
 
 
 def roll_along(

@@ -16,7 +16,7 @@ from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, frame_of, shifted
 from jaxsand.loop import Plain, repeat_until
 from jaxsand.resting import bring_to_rest, where_open
-from jaxsand.tool import Pose
+from jaxsand.scene.tools import Pose
 from jaxsand.turning import rotated
 from jaxsand.wheel import Stand, Track
 

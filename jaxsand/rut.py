@@ -19,12 +19,12 @@ import numpy as np
 from jaxsand.batch import cores
 from jaxsand.push import SteppedPush
 from jaxsand.scans import Scan, compare, measured_profile
-from jaxsand.scene import make_scene
+from jaxsand.scene.scene import make_scene
+from jaxsand.scene.tools import Wheel
+from jaxsand.scene.window import Window
 from jaxsand.sim import Push, check, step
 from jaxsand.split import SplitPush
-from jaxsand.tool import Wheel
 from jaxsand.trench import Pass, Profile, closed_form, relaxed
-from jaxsand.window import Window
 
 Tell = Callable[[str], None]
 Trench = tuple[float, float]  # slip angle (degrees), sinkage (mm)

@@ -11,12 +11,12 @@ import numpy as np
 
 from jaxsand.rules import UntilStill
 from jaxsand.rut import FIGURES, RULES, TRENCHES, errors, references, simulate_all
-from jaxsand.scene import make_scene
+from jaxsand.scene.scene import make_scene
+from jaxsand.scene.tools import Wheel
 from jaxsand.schemes import Multilevel, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.settling import settle
 from jaxsand.sim import act
 from jaxsand.split import SplitPush
-from jaxsand.tool import Wheel
 from jaxsand.trench import trimmed
 
 Tell = Callable[[str], None]

@@ -12,8 +12,8 @@ from functools import cache
 import jax
 import numpy as np
 
-from jaxsand.scene import Scene
-from jaxsand.walls import Draining
+from jaxsand.scene.boundaries import Draining
+from jaxsand.scene.scene import Scene
 
 
 @jax.tree_util.register_dataclass

@@ -14,9 +14,9 @@ from jaxsand.flux import Nothing, middle, steepest, worst_excess
 from jaxsand.levels import descend, start
 from jaxsand.march import March, Sand, march
 from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
-from jaxsand.scene import Scene, cast, fit
+from jaxsand.scene.scene import Scene, cast, fit
+from jaxsand.scene.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
 from jaxsand.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
-from jaxsand.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
 
 _WHOLE = Whole()
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.scene import Scene
-from jaxsand.tool import Pose
-from jaxsand.walls import Walls
+from jaxsand.scene.boundaries import Walls
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Pose
 
 _BENDS = 2
 

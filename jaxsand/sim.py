@@ -12,12 +12,12 @@ from jaxsand.legs import Pushed
 from jaxsand.push import SteppedPush, push_along, windows_for, with_near
 from jaxsand.roll import roll_along
 from jaxsand.rules import Outcome, Stop, check_rate, check_rule, check_whole
-from jaxsand.scene import Scene, as_array, cast, concrete, fit
+from jaxsand.scene.scene import Scene, as_array, cast, concrete, fit
+from jaxsand.scene.tools import Blade, NoTool, Pose, Wheel
 from jaxsand.schemes import Scheme
 from jaxsand.settling import Settled, relax
 from jaxsand.split import SplitPush, push_split
 from jaxsand.swath import SwathPush, push_swath
-from jaxsand.tool import Blade, NoTool, Pose, Wheel
 
 Push = SteppedPush | SwathPush | SplitPush
 _PUSHES: dict[tuple[type, type], Any] = {

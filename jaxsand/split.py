@@ -21,11 +21,11 @@ from jax import lax
 
 from jaxsand.displace import Job, whole
 from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Grousers, Pose, Wheel, carried_area, half_chord, local, reach
+from jaxsand.scene.window import Whole
 from jaxsand.slices import hat, wedge
 from jaxsand.swath import ROOM, complete, typical_drop
-from jaxsand.tool import Grousers, Pose, Wheel, carried_area, half_chord, local, reach
-from jaxsand.window import Whole
 
 _SAMPLES = 8  # of the cut, along each side of a cell
 _TEN = math.radians(10)

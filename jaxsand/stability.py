@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.grid import Neighbours, links
 from jaxsand.rules import Outcome, UntilStill
-from jaxsand.scene import make_scene
+from jaxsand.scene.boundaries import Draining, Walls
+from jaxsand.scene.grid import Neighbours, links
+from jaxsand.scene.scene import make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.settling import Settled, settle, settle_batch, steepest_slope
 from jaxsand.sim import rollout
 from jaxsand.task import volume_error
-from jaxsand.tool import Blade
-from jaxsand.walls import Draining, Walls
 
 Tell = Callable[[str], None]
 VOLUME = {"float16": 2e-3, "float32": 1e-6, "float64": 1e-12}  # the largest volume error

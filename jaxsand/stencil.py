@@ -15,7 +15,7 @@ from jax.custom_derivatives import linear_call
 
 from jaxsand.bed import at, halo
 from jaxsand.flux import Fluxes, ends, received
-from jaxsand.grid import Neighbours, links
+from jaxsand.scene.grid import Neighbours, links
 
 _SMALL = 24  # rows
 

@@ -8,12 +8,12 @@ import numpy as np
 
 from jaxsand import goals, task
 from jaxsand.rules import UntilStill
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.settling import settle
 from jaxsand.shaping import terrain_surface
 from jaxsand.sim import check, rollout
 from jaxsand.strokeloss import SandLoss
-from jaxsand.tool import Blade
 
 CELLS, SPACING = 32, 0.01
 """Cells along a side of the map that glyphs are judged on, and their size (m)."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.pusher import step_batch, value_and_grad_batch
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 from jaxsand.task import fits
 
 GRADIENT = 4

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 
 GLYPH_SQUARE = (0.035, 0.285)
 """Where a glyph's unit square lies on the 32 x 32 map of 0.01 m cells, in x and y (m)."""

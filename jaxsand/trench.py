@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from jaxsand.rules import UntilStill
-from jaxsand.scene import make_scene
+from jaxsand.scene.scene import make_scene
 from jaxsand.schemes import SuperTimeStepping
 from jaxsand.settling import settle_batch
 

@@ -13,8 +13,8 @@ from jaxsand.bed import at
 from jaxsand.block import Moving, Way
 from jaxsand.frame import Frame
 from jaxsand.resting import bring_to_rest
+from jaxsand.scene.tools import Pose
 from jaxsand.stencil import inner
-from jaxsand.tool import Pose
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from jaxsand.bed import at, truncate
 from jaxsand.block import Block, First, View, Way
 from jaxsand.flux import NARROW, Fluxes
 from jaxsand.frame import Frame
-from jaxsand.grid import Neighbours
 from jaxsand.resting import Sand
+from jaxsand.scene.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, outer, seen, spread
 
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it

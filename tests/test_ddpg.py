@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams, StrokeState
-from jaxsand.scene import make_scene
+from jaxsand.scene.scene import make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import usual_scene
-from jaxsand.tool import Blade
 from tests.test_probes import prober
 from train.actor import Acts
 from train.ddpg import Ddpg, begin, practise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsand.lookahead import look_ahead, one_after_the_other, put_right
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokegoals import letters
 from jaxsand.strokeloss import SandLoss

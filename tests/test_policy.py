@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from jaxsand.policy import Policy, load_policy, save_policy
-from jaxsand.scene import make_scene
+from jaxsand.scene.scene import make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.strokenet import (
     Lines,
     Scores,
@@ -20,7 +21,6 @@ from jaxsand.strokenet import (
     spread,
     symmetric,
 )
-from jaxsand.tool import Blade
 from jaxsand.turns import turned, turned_back, turned_strokes, turned_strokes_back
 
 NET = StrokeNet((8, 8, 8), (1, 1, 1))

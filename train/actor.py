@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
-from jaxsand.scene import Scene, blade_of
+from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.strokegoals import CELLS
 from train.nets import Actor, Critic
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxsand import goals, task
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import CELLS, SPACING, StrokeGoal, letters, letters_on_rough_sand, stroke_goal, turned_letters
-from jaxsand.tool import Blade
 from train.plans import random_plans
 
 _SEED = 2_000_003

@@ -22,7 +22,7 @@ import optax
 
 from jaxsand.lookahead import one_after_the_other
 from jaxsand.policy import Policy, in_batches
-from jaxsand.scene import Scene, blade_of
+from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.strokegoals import CELLS, SPACING, usual_scene
 from jaxsand.strokenet import StrokeNet, ends, judge, likeliest, spread
 from jaxsand.success import right, strokes_right

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 from jaxsand.strokeloss import pushed
 from train.plans import MOST, anywhere, random_plans
 

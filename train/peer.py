@@ -23,10 +23,10 @@ from jaxsand.optimise import optimise_strokes
 from jaxsand.policy import load_policy
 from jaxsand.rules import check_whole
 from jaxsand.sandplan import plan_sand
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokeloss import SandLoss
-from jaxsand.tool import Blade
 
 _SHAPE, _SPACING, _ANGLE = (30, 60), 0.01, math.radians(30)
 _CHANGED = 0.1  # of the goal's depth

@@ -12,10 +12,10 @@ from jaxsand import task
 from jaxsand.env.library import RandomStrokes
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.lookahead import one_after_the_other
+from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import usual_scene
 from jaxsand.strokeloss import pushed
 from jaxsand.success import right
-from jaxsand.tool import Blade
 from train.actor import Acts
 from train.probes import Probe
 

@@ -27,7 +27,7 @@ def run_settle(options: argparse.Namespace) -> None:
         heights = heights.astype(np.float32)
     from jaxsand import schemes
     from jaxsand.rules import Outcome, UntilStill
-    from jaxsand.scene import make_scene
+    from jaxsand.scene.scene import make_scene
     from jaxsand.settling import settle
     from jaxsand.sim import OutcomeError, check
     from jaxsand.task import volume_error

@@ -26,9 +26,9 @@ from jaxsand.env.pushing import ByLength, Together
 from jaxsand.env.spaces import Box, Dict, Discrete
 from jaxsand.push import SteppedPush, with_near
 from jaxsand.rules import check_whole
-from jaxsand.scene import Scene, make_scene
-from jaxsand.tool import Blade
-from jaxsand.window import Whole, Window
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
+from jaxsand.scene.window import Whole, Window
 
 __all__ = [
     "Box",

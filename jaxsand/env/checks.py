@@ -10,7 +10,7 @@ from jaxsand.env.onmap import OnMap
 from jaxsand.env.onsand import OnSand
 from jaxsand.env.pushing import Batching, Push
 from jaxsand.rules import Stop as StopRule
-from jaxsand.scene import Scene, blade_of, concrete
+from jaxsand.scene.scene import Scene, blade_of, concrete
 
 _KINDS: dict[str, Any] = {
     "on": OnMap | OnSand,

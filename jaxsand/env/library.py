@@ -15,7 +15,7 @@ from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
 from jaxsand.env.pushing import Pushing
 from jaxsand.goals import stroke_list
 from jaxsand.rules import UntilStill
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 from jaxsand.settling import settle_batch
 from jaxsand.sim import check
 

@@ -13,7 +13,7 @@ from jaxsand.env.pushing import Batching, ByLength, Push
 from jaxsand.env.spaces import Box, Dict
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Stop as StopRule
-from jaxsand.scene import Scene, blade_of
+from jaxsand.scene.scene import Scene, blade_of
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from jaxsand.env.maps import MapGoals, Walks
 from jaxsand.env.onmap import MapParams, MapState, OnMap
 from jaxsand.env.spaces import Box, Dict, Discrete
 from jaxsand.push import SteppedPush
-from jaxsand.scene import Scene, blade_of
+from jaxsand.scene.scene import Scene, blade_of
+from jaxsand.scene.tools import Pose, coverage
 from jaxsand.shaping import Layout
 from jaxsand.sim import act
-from jaxsand.tool import Pose, coverage
 
 
 @jax.tree_util.register_dataclass

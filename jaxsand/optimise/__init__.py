@@ -17,7 +17,7 @@ from jaxsand.optimise import moves
 from jaxsand.optimise.account import Account
 from jaxsand.optimise.sketch import Print, guesses
 from jaxsand.rules import check_whole
-from jaxsand.scene import Scene, as_array, blade_of
+from jaxsand.scene.scene import Scene, as_array, blade_of
 from jaxsand.strokeloss import Best, SandLoss, pushed
 
 _LANES = 4  # plans that go downhill together

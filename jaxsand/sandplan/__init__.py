@@ -13,7 +13,7 @@ from jaxsand.sandplan.reach import blade_size, least_distance
 from jaxsand.sandplan.rollouts import Effort, distance, replay
 from jaxsand.sandplan.steps import search_steps
 from jaxsand.sandplan.strokes import search_strokes
-from jaxsand.scene import Scene, as_array, fit
+from jaxsand.scene.scene import Scene, as_array, fit
 from jaxsand.settling import steepest_slope
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 
 Path = np.ndarray  # [n, 2]: x, y (m)
 

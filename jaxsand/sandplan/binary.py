@@ -7,7 +7,7 @@ import numpy as np
 from jaxsand.planner import connected_pieces, plan
 from jaxsand.sandplan.actions import Job, Steps, corners, longest_stroke
 from jaxsand.sandplan.reach import blade_size
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 
 _HINTS = 24
 

@@ -22,9 +22,9 @@ import math
 
 import numpy as np
 
-from jaxsand.scene import Scene
-from jaxsand.tool import Blade
-from jaxsand.walls import Closed
+from jaxsand.scene.boundaries import Closed
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Blade
 
 
 def least_distance(scene: Scene, height: np.ndarray, goal: np.ndarray, strokes: int, longest: float) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxsand.pusher import act_batch, step_batch
 from jaxsand.rules import Sweeps
 from jaxsand.sandplan.actions import Path
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 from jaxsand.settling import settle_batch
 from jaxsand.sim import check, follow
 from jaxsand.swath import SwathPush

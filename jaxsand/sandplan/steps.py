@@ -6,7 +6,7 @@ import numpy as np
 from jaxsand.rules import Outcome
 from jaxsand.sandplan.actions import Job, Path, corners
 from jaxsand.sandplan.rollouts import Effort, distance, distinct, marks, walked
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 from jaxsand.sim import follow
 
 _MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])

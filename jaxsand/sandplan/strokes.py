@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsand.sandplan.actions import Job, Path, confined, moved, propose
 from jaxsand.sandplan.rollouts import CHEAP, Effort, distance, distinct, marks, pushed, roughly_pushed
-from jaxsand.scene import Scene
+from jaxsand.scene.scene import Scene
 
 _LAYERS = 0.25  # of the budget goes to the layers, half of it to rough pushes
 _GRAIN = 1 / 20  # of the largest height to change: what maps are told apart by

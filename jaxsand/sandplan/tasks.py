@@ -9,10 +9,10 @@ import numpy as np
 from jaxsand import goals, task
 from jaxsand.sandplan.actions import Actions, Lattice, Steps
 from jaxsand.sandplan.rollouts import replay
-from jaxsand.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
 from jaxsand.settling import settle
 from jaxsand.sim import check
-from jaxsand.tool import Blade
 
 _SHAPE, _SPACING = (32, 32), 0.01
 

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.grid import Grid, Neighbours
-from jaxsand.material import DRY_SAND, Material
-from jaxsand.tool import Blade, Grousers, NoTool, Smooth, Wheel
-from jaxsand.walls import Closed, Draining, Open, Walls
-from jaxsand.window import AsNeeded, Whole, Window
+from jaxsand.scene.boundaries import Closed, Draining, Open, Walls
+from jaxsand.scene.grid import Grid, Neighbours
+from jaxsand.scene.material import DRY_SAND, Material
+from jaxsand.scene.tools import Blade, Grousers, NoTool, Smooth, Wheel
+from jaxsand.scene.window import AsNeeded, Whole, Window
 
 
 @jax.tree_util.register_dataclass

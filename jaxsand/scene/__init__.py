@@ -1,0 +1,1 @@
+"""What the world is, checked: grid, material, walls and edges, tools, windows, and the scene that holds them."""
