@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import blade
+from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.bed import at, halo
 from jaxsand.block import Block, First, Moving, Stand, View, Way, pose_ahead
 from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
-from jaxsand.loop import Plain, split
 from jaxsand.rested import Rested, blank, rest_pulled, rest_taped
 from jaxsand.resting import Links, Sand, bring_to_rest
 from jaxsand.stencil import inner, spread

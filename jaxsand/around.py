@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import adjoint
+from jaxsand.autodiff.while_loop import Plain, repeat, split
 from jaxsand.bed import Bed, Lost, at, halo
 from jaxsand.flux import Around, flows
-from jaxsand.loop import Plain, repeat, split
 from jaxsand.scene.grid import links
 from jaxsand.sweep import Flow, counted, pass_over
 

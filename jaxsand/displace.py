@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand.around import Beside
+from jaxsand.autodiff.while_loop import repeat
 from jaxsand.bed import Bed, Lost, truncate
 from jaxsand.flux import stand
-from jaxsand.loop import repeat
 from jaxsand.sweep import Flow
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
 from jaxsand.bed import Bed, Lost, grain, truncate
 from jaxsand.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
-from jaxsand.loop import Plain, Step, repeat, repeat_until
 from jaxsand.scene.grid import links
 from jaxsand.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.surge import Surges

@@ -22,10 +22,10 @@ import numpy as np
 from jax import lax
 
 from jaxsand.advance import Advance, Rest
+from jaxsand.autodiff.while_loop import repeat, repeat_until
 from jaxsand.block import SPARE, Block, Moving, Way
 from jaxsand.displace import Job
 from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
-from jaxsand.loop import repeat, repeat_until
 from jaxsand.lowering import Lower
 from jaxsand.resting import bring_to_rest, no_flux
 from jaxsand.scene.scene import Scene, concrete

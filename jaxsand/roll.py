@@ -22,10 +22,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.autodiff.while_loop import repeat, repeat_until
 from jaxsand.block import Block, Moving, Way
 from jaxsand.displace import Job
 from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
-from jaxsand.loop import repeat, repeat_until
 from jaxsand.push import SteppedPush
 from jaxsand.resting import no_flux
 from jaxsand.rolling import Roll, Touchdown, Turn

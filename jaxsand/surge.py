@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import adjoint
+from jaxsand.autodiff.while_loop import Plain, repeat, split
 from jaxsand.bed import Bed, at, grain, halo
 from jaxsand.flux import Nothing, Partial
-from jaxsand.loop import Plain, repeat, split
 from jaxsand.schemes import Schedule
 from jaxsand.sweep import Flow, surge
 

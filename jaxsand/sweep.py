@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import adjoint
+from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
 from jaxsand.flux import Fluxes, Nothing, Partial, fluxes, gained
-from jaxsand.loop import Plain, split
 
 
 @jax.tree_util.register_dataclass

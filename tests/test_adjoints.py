@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.loop import Plain, repeat, repeat_until
+from jaxsand.autodiff.while_loop import Plain, repeat, repeat_until
 
 SHAPE = (14, 16)
 RNG = np.random.default_rng(4)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.loop import Plain, repeat_until
+from jaxsand.autodiff.while_loop import Plain, repeat_until
 
 from .conftest import ANGLE
 

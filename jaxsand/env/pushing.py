@@ -21,7 +21,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.flatten_util import ravel_pytree
 
-from jaxsand.loop import first_order, split
+from jaxsand.autodiff.while_loop import first_order, split
 from jaxsand.push import SteppedPush
 from jaxsand.rules import Stop, check_whole
 from jaxsand.scene.scene import Scene, cast

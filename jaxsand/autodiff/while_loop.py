@@ -16,8 +16,8 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from jaxsand import lockstep
-from jaxsand.lockstep import Done, Tree
+from jaxsand.autodiff import _batched_while as lockstep
+from jaxsand.autodiff._batched_while import Done, Tree
 
 
 class Step(Protocol):
