@@ -15,10 +15,10 @@ from jax import lax
 
 from jaxsand import blade
 from jaxsand.autodiff.while_loop import Plain, split
-from jaxsand.bed import at, halo
 from jaxsand.block import Block, First, Moving, Stand, View, Way, pose_ahead
-from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
+from jaxsand.relaxation._ghost_cells import at, halo
+from jaxsand.relaxation.flux import Fluxes
 from jaxsand.rested import Rested, blank, rest_pulled, rest_taped
 from jaxsand.resting import Links, Sand, bring_to_rest
 from jaxsand.stencil import inner, spread

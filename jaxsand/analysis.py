@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.bed import at, halo, largest, prepare, quantum
-from jaxsand.flux import Nothing
 from jaxsand.plain import settle_numpy
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation._ghost_cells import at, halo, largest, prepare, quantum
+from jaxsand.relaxation.flux import Nothing
+from jaxsand.relaxation.schemes import Relaxation
+from jaxsand.relaxation.settling import relax, settle, settle_batch
+from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.relaxation.sweep import Flow, sweep
 from jaxsand.scene.scene import Scene, make_scene
-from jaxsand.schemes import Relaxation
-from jaxsand.settling import relax, settle, settle_batch
-from jaxsand.sweep import Flow, sweep
 from jaxsand.workprec import COLUMN, RIDGE, distance, trench
 
 Tell = Callable[[str], None]

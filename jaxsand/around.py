@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import adjoint
 from jaxsand.autodiff.while_loop import Plain, repeat, split
-from jaxsand.bed import Bed, Lost, at, halo
-from jaxsand.flux import Around, flows
+from jaxsand.relaxation import _flux_adjoint as adjoint
+from jaxsand.relaxation._ghost_cells import Bed, Lost, at, halo
+from jaxsand.relaxation.flux import Around, flows
+from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
-from jaxsand.sweep import Flow, counted, pass_over
 
 
 @dataclass(frozen=True)

@@ -33,15 +33,15 @@ from jaxsand import (
     strokebench,
     workprec,
 )
-from jaxsand.batch import cores
 from jaxsand.files import as_table
 from jaxsand.letterbench import bench_letters
 from jaxsand.plain import compile_c, settle_numpy
-from jaxsand.rules import Sweeps, UntilStill
+from jaxsand.relaxation._batching import cores
+from jaxsand.relaxation.schemes import Relaxation, SuperTimeStepping
+from jaxsand.relaxation.settling import Settled, settle, settle_batch
+from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.schemes import Relaxation, SuperTimeStepping
-from jaxsand.settling import Settled, settle, settle_batch
 from jaxsand.sim import act
 
 Tell = Callable[[str], None]

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.bed import at, truncate
 from jaxsand.displace import EIGHT, shares
-from jaxsand.flux import Fluxes
+from jaxsand.relaxation._ghost_cells import at, truncate
+from jaxsand.relaxation.flux import Fluxes
 from jaxsand.scene.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, outer, seen
 

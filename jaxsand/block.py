@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import blade
-from jaxsand.bed import Lost, at, halo, lose, nearest
-from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, Places, cut, numbers, paste, places
+from jaxsand.relaxation._ghost_cells import Lost, at, halo, lose, nearest
+from jaxsand.relaxation.flux import Fluxes
 from jaxsand.resting import Sand, where_open
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.tools import Pose

@@ -10,10 +10,10 @@ import numpy as np
 
 from jaxsand.calibration import Trial, calibrate
 from jaxsand.finer import OneGrid, TwoGrids
+from jaxsand.relaxation.settling import settle
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.settling import settle
 from jaxsand.sim import Push, step
 from jaxsand.swath import SwathPush
 

@@ -13,12 +13,12 @@ import numpy as np
 from jaxsand.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
 from jaxsand.limit import Reference
-from jaxsand.rules import Stop, check_rule, check_whole
+from jaxsand.relaxation.schemes import Scheme
+from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, concrete, fit
 from jaxsand.scene.tools import NoTool
-from jaxsand.schemes import Scheme
-from jaxsand.settling import settle
 from jaxsand.sim import Push, check_push, rollout
 
 Free = Sequence[str] | Mapping[str, tuple[float, float]]

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 
 from jaxsand.around import Beside
 from jaxsand.autodiff.while_loop import repeat
-from jaxsand.bed import Bed, Lost, truncate
-from jaxsand.flux import stand
-from jaxsand.sweep import Flow
+from jaxsand.relaxation._ghost_cells import Bed, Lost, truncate
+from jaxsand.relaxation.flux import stand
+from jaxsand.relaxation.sweep import Flow
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]

@@ -16,9 +16,9 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxsand.batch import wide_vectors
 from jaxsand.env import LevelGoals, OnSand, Together, Walks, make, pool_of
-from jaxsand.rules import Sweeps, UntilStill
+from jaxsand.relaxation._batching import wide_vectors
+from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.window import Whole
 from jaxsand.strokeloss import pushed
 from jaxsand.swath import SwathPush

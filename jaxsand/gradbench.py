@@ -22,7 +22,7 @@ from jaxsand.gradcheck import (
     sloped,
 )
 from jaxsand.push import SteppedPush
-from jaxsand.rules import Stop, Sweeps, UntilStill
+from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
 from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window

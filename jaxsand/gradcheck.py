@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.rules import Stop, Sweeps
+from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.stopping import Stop, Sweeps
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window
-from jaxsand.settling import settle
 from jaxsand.sim import act, step
 
 Inputs = tuple[Any, Any, Any]

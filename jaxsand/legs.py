@@ -8,16 +8,28 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.bed import Lost, halo, largest, mark, nothing_lost, prepare, quantum, sound, spoiled, unmark, volume_lost
 from jaxsand.displace import Job
-from jaxsand.flux import worst_excess
-from jaxsand.rules import Outcome, said
+from jaxsand.relaxation._ghost_cells import (
+    Lost,
+    halo,
+    largest,
+    mark,
+    nothing_lost,
+    prepare,
+    quantum,
+    sound,
+    spoiled,
+    unmark,
+    volume_lost,
+)
+from jaxsand.relaxation.flux import worst_excess
+from jaxsand.relaxation.stopping import Outcome, said
+from jaxsand.relaxation.sweep import Flow
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import NoTool, Pose, extent, local, lowest, reach
 from jaxsand.scene.tools import usable as makes_sense
 from jaxsand.scene.window import Window
-from jaxsand.sweep import Flow
 
 
 @jax.tree_util.register_dataclass

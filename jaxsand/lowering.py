@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxsand import blade
 from jaxsand.advance import Step
 from jaxsand.autodiff.while_loop import Plain, repeat_until
-from jaxsand.bed import at, truncate
 from jaxsand.block import Moving, Way
 from jaxsand.frame import frame_of
+from jaxsand.relaxation._ghost_cells import at, truncate
 from jaxsand.stencil import inner
 
 

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.boundaries import Draining
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import make_scene
-from jaxsand.settling import settle
 from jaxsand.workprec import MU, roof
 
 Tell = Callable[[str], None]

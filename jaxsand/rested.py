@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.flux import Fluxes
+from jaxsand.relaxation.flux import Fluxes
 from jaxsand.resting import Links
 from jaxsand.stencil import inner, net, outer, rises, steps, total
 

@@ -29,8 +29,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.bed import nearest, truncate
-from jaxsand.flux import Fluxes, ends
+from jaxsand.relaxation._ghost_cells import nearest, truncate
+from jaxsand.relaxation.flux import Fluxes, ends
 from jaxsand.scene.grid import Neighbours, links
 from jaxsand.stencil import both_ends, inner, net, outer, rises
 

@@ -11,10 +11,10 @@ from jax import lax
 from jaxsand import wheel
 from jaxsand.advance import Step
 from jaxsand.autodiff.while_loop import Plain, repeat_until
-from jaxsand.bed import at, truncate
 from jaxsand.block import First, Moving, View, pose_ahead
-from jaxsand.flux import Fluxes
 from jaxsand.frame import Frame, frame_of, shifted
+from jaxsand.relaxation._ghost_cells import at, truncate
+from jaxsand.relaxation.flux import Fluxes
 from jaxsand.resting import bring_to_rest, where_open
 from jaxsand.scene.tools import Pose
 from jaxsand.turning import rotated

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.batch import cores
 from jaxsand.push import SteppedPush
+from jaxsand.relaxation._batching import cores
 from jaxsand.scans import Scan, compare, measured_profile
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel

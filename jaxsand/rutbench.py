@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation.schemes import Multilevel, Relaxation, Scheme, SuperTimeStepping
+from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.rut import FIGURES, RULES, TRENCHES, errors, references, simulate_all
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
-from jaxsand.schemes import Multilevel, Relaxation, Scheme, SuperTimeStepping
-from jaxsand.settling import settle
 from jaxsand.sim import act
 from jaxsand.split import SplitPush
 from jaxsand.trench import trimmed

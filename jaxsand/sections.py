@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, conclude, spread
-from jaxsand.rules import check_whole
+from jaxsand.relaxation.stopping import check_whole
 from jaxsand.trench import Pass, Profile, relaxing
 
 _SHARED = ("repose_angle", "radius", "width")

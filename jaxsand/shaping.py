@@ -16,11 +16,11 @@ from jaxsand import goals, task
 from jaxsand.optimise import Optimised
 from jaxsand.planner import Cell, connected_pieces, plan
 from jaxsand.push import SteppedPush
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation.settling import settle, steepest_slope
+from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.sandplan import SandPlan
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.settling import settle, steepest_slope
 from jaxsand.sim import Shaped, act, check, follow_frames
 from jaxsand.stages import Planned
 

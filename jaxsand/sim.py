@@ -10,12 +10,12 @@ import numpy as np
 
 from jaxsand.legs import Pushed
 from jaxsand.push import SteppedPush, push_along, windows_for, with_near
+from jaxsand.relaxation.schemes import Scheme
+from jaxsand.relaxation.settling import Settled, relax
+from jaxsand.relaxation.stopping import Outcome, Stop, check_rate, check_rule, check_whole
 from jaxsand.roll import roll_along
-from jaxsand.rules import Outcome, Stop, check_rate, check_rule, check_whole
 from jaxsand.scene.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.scene.tools import Blade, NoTool, Pose, Wheel
-from jaxsand.schemes import Scheme
-from jaxsand.settling import Settled, relax
 from jaxsand.split import SplitPush, push_split
 from jaxsand.swath import SwathPush, push_swath
 

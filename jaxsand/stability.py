@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.rules import Outcome, UntilStill
+from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
+from jaxsand.relaxation.settling import Settled, settle, settle_batch, steepest_slope
+from jaxsand.relaxation.stopping import Outcome, UntilStill
 from jaxsand.scene.boundaries import Draining, Walls
 from jaxsand.scene.grid import Neighbours, links
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
-from jaxsand.settling import Settled, settle, settle_batch, steepest_slope
 from jaxsand.sim import rollout
 from jaxsand.task import volume_error
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxsand import goals, task
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.settling import settle
 from jaxsand.shaping import terrain_surface
 from jaxsand.sim import check, rollout
 from jaxsand.strokeloss import SandLoss

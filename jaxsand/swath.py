@@ -28,11 +28,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.bed import Lost, lose
 from jaxsand.displace import Job, contact, settle_around, take, whole
 from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
 from jaxsand.mound import Lean, heights, held, lean, reach_of, unbounded
 from jaxsand.overflow import Rim, nothing_beyond
+from jaxsand.relaxation._ghost_cells import Lost, lose
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, coverage, local

@@ -25,10 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation.schemes import SuperTimeStepping
+from jaxsand.relaxation.settling import settle_batch
+from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import make_scene
-from jaxsand.schemes import SuperTimeStepping
-from jaxsand.settling import settle_batch
 
 _TEN = math.radians(10)
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from jaxsand import blade
 from jaxsand.advance import Rest, Step
-from jaxsand.bed import at
 from jaxsand.block import Moving, Way
 from jaxsand.frame import Frame
+from jaxsand.relaxation._ghost_cells import at
 from jaxsand.resting import bring_to_rest
 from jaxsand.scene.tools import Pose
 from jaxsand.stencil import inner

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand import blade
-from jaxsand.bed import at, truncate
 from jaxsand.block import Block, First, View, Way
-from jaxsand.flux import NARROW, Fluxes
 from jaxsand.frame import Frame
+from jaxsand.relaxation._ghost_cells import at, truncate
+from jaxsand.relaxation.flux import NARROW, Fluxes
 from jaxsand.resting import Sand
 from jaxsand.scene.grid import Neighbours
 from jaxsand.stencil import both_ends, inner, outer, seen, spread

@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
+from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.boundaries import Draining
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import Scene, make_scene
-from jaxsand.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
-from jaxsand.settling import settle
 
 Tell = Callable[[str], None]
 MU = math.tan(math.radians(29))

@@ -9,7 +9,7 @@ from jaxsand import gradbench
 from jaxsand.__main__ import main
 from jaxsand.benchmark import table
 from jaxsand.gradcheck import Case
-from jaxsand.rules import Sweeps, UntilStill
+from jaxsand.relaxation.stopping import Sweeps, UntilStill
 
 SMALL = (Case(False),)
 

@@ -61,7 +61,8 @@ def test_six_calls_of_two_kinds_and_three_angles_trace_twice():
 
 
 def test_public_functions_trace_once_whatever_kind_of_number_is_given():
-    from jaxsand import settling, sim
+    from jaxsand import sim
+    from jaxsand.relaxation import settling
 
     for module, name in ((settling, "_settle"), (sim, "_follow")):
         getattr(module, name).clear_cache()

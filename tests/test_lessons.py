@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsand.settling import steepest_slope
+from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.strokegoals import CELLS, SPACING, usual_scene
 from jaxsand.strokeloss import pushed
 from jaxsand.task import GLYPH_SQUARE

@@ -11,7 +11,7 @@ import jaxsand as js
 from jaxsand import env as envs
 from jaxsand import goals, task
 from jaxsand.env.pushing import ByLength
-from jaxsand.settling import steepest_slope
+from jaxsand.relaxation.settling import steepest_slope
 
 from .conftest import MU
 from .env_cases import KEY, LETTERS, SMALL, one_map, program, small

@@ -199,10 +199,10 @@ def test_outcome_names_a_bound_that_is_too_small():
 @pytest.mark.parametrize(("neighbours", "limit"), [(4, 1 / 4), (8, 1 / (2 + 2 * math.sqrt(2)))])
 def test_the_stable_range_is_where_the_checkerboard_stops_shrinking(neighbours, limit):
     """Just inside the range a steep checkerboard calms down; just outside it is refused, and would grow."""
-    from jaxsand.bed import at, halo, prepare, quantum
-    from jaxsand.flux import Nothing
-    from jaxsand.settling import relax
-    from jaxsand.sweep import Flow, sweep
+    from jaxsand.relaxation._ghost_cells import at, halo, prepare, quantum
+    from jaxsand.relaxation.flux import Nothing
+    from jaxsand.relaxation.settling import relax
+    from jaxsand.relaxation.sweep import Flow, sweep
 
     # Rows of alternating sign for 8 neighbours, the full checkerboard for 4: the fastest-growing modes.
     i, j = np.indices((16, 16))

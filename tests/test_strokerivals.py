@@ -9,7 +9,7 @@ import pytest
 import jaxsand as js
 from jaxsand import strokebench
 from jaxsand.__main__ import main
-from jaxsand.rules import Outcome
+from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.window import Window
 from jaxsand.sim import rollout
 from jaxsand.strokebench import reached, run_all

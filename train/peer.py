@@ -21,7 +21,7 @@ from jaxsand.commands.arguments import Parser, count, ended, seed
 from jaxsand.files import as_json, as_table, progress
 from jaxsand.optimise import optimise_strokes
 from jaxsand.policy import load_policy
-from jaxsand.rules import check_whole
+from jaxsand.relaxation.stopping import check_whole
 from jaxsand.sandplan import plan_sand
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade

@@ -5,9 +5,9 @@ import math
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from jaxsand.relaxation.settling import settle_batch
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.settling import settle_batch
 from jaxsand.strokegoals import CELLS, SPACING
 
 _RELIEF = 0.015  # m, at most

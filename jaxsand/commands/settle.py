@@ -25,10 +25,10 @@ def run_settle(options: argparse.Namespace) -> None:
         jax.config.update("jax_enable_x64", True)
     elif heights.dtype.kind != "f":
         heights = heights.astype(np.float32)
-    from jaxsand import schemes
-    from jaxsand.rules import Outcome, UntilStill
+    from jaxsand.relaxation import schemes
+    from jaxsand.relaxation.settling import settle
+    from jaxsand.relaxation.stopping import Outcome, UntilStill
     from jaxsand.scene.scene import make_scene
-    from jaxsand.settling import settle
     from jaxsand.sim import OutcomeError, check
     from jaxsand.task import volume_error
 

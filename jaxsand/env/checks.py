@@ -9,7 +9,7 @@ from jaxsand.env.multi import LevelGoals, NoStop, OnlyDug, RoughGoals, Stop, Wit
 from jaxsand.env.onmap import OnMap
 from jaxsand.env.onsand import OnSand
 from jaxsand.env.pushing import Batching, Push
-from jaxsand.rules import Stop as StopRule
+from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of, concrete
 
 _KINDS: dict[str, Any] = {

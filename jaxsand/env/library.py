@@ -14,9 +14,9 @@ from jaxsand import task
 from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
 from jaxsand.env.pushing import Pushing
 from jaxsand.goals import stroke_list
-from jaxsand.rules import UntilStill
+from jaxsand.relaxation.settling import settle_batch
+from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene
-from jaxsand.settling import settle_batch
 from jaxsand.sim import check
 
 _TRIES = 16

@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxsand.autodiff.while_loop import first_order, split
 from jaxsand.push import SteppedPush
-from jaxsand.rules import Stop, check_whole
+from jaxsand.relaxation.stopping import Stop, check_whole
 from jaxsand.scene.scene import Scene, cast
 from jaxsand.sim import step
 from jaxsand.swath import SwathPush

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsand.optimise import moves
 from jaxsand.optimise.account import Account
 from jaxsand.optimise.sketch import Print, guesses
-from jaxsand.rules import check_whole
+from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, as_array, blade_of
 from jaxsand.strokeloss import Best, SandLoss, pushed
 

@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 
 from jaxsand import task
-from jaxsand.rules import check_whole
+from jaxsand.relaxation.settling import steepest_slope
+from jaxsand.relaxation.stopping import check_whole
 from jaxsand.sandplan.actions import Actions, Job, Lattice, Path, Steps, longest_stroke
 from jaxsand.sandplan.binary import binary_hints, binary_paths
 from jaxsand.sandplan.reach import blade_size, least_distance
@@ -14,7 +15,6 @@ from jaxsand.sandplan.rollouts import Effort, distance, replay
 from jaxsand.sandplan.steps import search_steps
 from jaxsand.sandplan.strokes import search_strokes
 from jaxsand.scene.scene import Scene, as_array, fit
-from jaxsand.settling import steepest_slope
 
 
 @dataclass(frozen=True)

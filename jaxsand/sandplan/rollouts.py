@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from jaxsand.pusher import act_batch, step_batch
-from jaxsand.rules import Sweeps
+from jaxsand.relaxation.settling import settle_batch
+from jaxsand.relaxation.stopping import Sweeps
 from jaxsand.sandplan.actions import Path
 from jaxsand.scene.scene import Scene
-from jaxsand.settling import settle_batch
 from jaxsand.sim import check, follow
 from jaxsand.swath import SwathPush
 

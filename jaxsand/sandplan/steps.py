@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from jaxsand.rules import Outcome
+from jaxsand.relaxation.stopping import Outcome
 from jaxsand.sandplan.actions import Job, Path, corners
 from jaxsand.sandplan.rollouts import Effort, distance, distinct, marks, walked
 from jaxsand.scene.scene import Scene

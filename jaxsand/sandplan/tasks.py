@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 
 from jaxsand import goals, task
+from jaxsand.relaxation.settling import settle
 from jaxsand.sandplan.actions import Actions, Lattice, Steps
 from jaxsand.sandplan.rollouts import replay
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.settling import settle
 from jaxsand.sim import check
 
 _SHAPE, _SPACING = (32, 32), 0.01

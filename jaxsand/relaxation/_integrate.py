@@ -11,12 +11,12 @@ import numpy as np
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
-from jaxsand.bed import Bed, Lost, grain, truncate
-from jaxsand.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.relaxation._ghost_cells import Bed, Lost, grain, truncate
+from jaxsand.relaxation._rkl import Surges
+from jaxsand.relaxation.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
+from jaxsand.relaxation.sweep import Flow, Sweep, apply
 from jaxsand.scene.grid import links
-from jaxsand.schemes import Pairwise, Relaxation, Schedule
-from jaxsand.surge import Surges
-from jaxsand.sweep import Flow, Sweep, apply
 
 Sand = tuple[jax.Array, Lost]  # a map with halo, and what it lost over the rim
 

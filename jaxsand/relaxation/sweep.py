@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import adjoint
 from jaxsand.autodiff.while_loop import Plain, split
-from jaxsand.bed import Bed, Lost, at, halo, lose, truncate
-from jaxsand.flux import Fluxes, Nothing, Partial, fluxes, gained
+from jaxsand.relaxation import _flux_adjoint as adjoint
+from jaxsand.relaxation._ghost_cells import Bed, Lost, at, halo, lose, truncate
+from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
 
 
 @jax.tree_util.register_dataclass

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
 from jaxsand.scene.scene import Scene, as_array, check_window, concrete
 from jaxsand.scene.window import Whole, Window
-from jaxsand.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
 
 _MOST = 1_000_000_000  # sweeps, which are counted in 32 bits
 

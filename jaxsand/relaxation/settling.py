@@ -8,15 +8,28 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.batch import march_batch, on_all_cores, wide_vectors
-from jaxsand.bed import Bed, Lost, at, halo, largest, mark, nothing_lost, prepare, sound, spoiled, unmark, volume_lost
-from jaxsand.flux import Nothing, middle, steepest, worst_excess
-from jaxsand.levels import descend, start
-from jaxsand.march import March, Sand, march
-from jaxsand.rules import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
+from jaxsand.relaxation._batching import march_batch, on_all_cores, wide_vectors
+from jaxsand.relaxation._ghost_cells import (
+    Bed,
+    Lost,
+    at,
+    halo,
+    largest,
+    mark,
+    nothing_lost,
+    prepare,
+    sound,
+    spoiled,
+    unmark,
+    volume_lost,
+)
+from jaxsand.relaxation._integrate import March, Sand, march
+from jaxsand.relaxation._multigrid import descend, start
+from jaxsand.relaxation.flux import Nothing, middle, steepest, worst_excess
+from jaxsand.relaxation.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
+from jaxsand.relaxation.stopping import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
 from jaxsand.scene.scene import Scene, cast, fit
 from jaxsand.scene.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
-from jaxsand.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
 
 _WHOLE = Whole()
 

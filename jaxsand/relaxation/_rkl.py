@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import adjoint
 from jaxsand.autodiff.while_loop import Plain, repeat, split
-from jaxsand.bed import Bed, at, grain, halo
-from jaxsand.flux import Nothing, Partial
-from jaxsand.schemes import Schedule
-from jaxsand.sweep import Flow, surge
+from jaxsand.relaxation import _flux_adjoint as adjoint
+from jaxsand.relaxation._ghost_cells import Bed, at, grain, halo
+from jaxsand.relaxation.flux import Nothing, Partial
+from jaxsand.relaxation.schemes import Schedule
+from jaxsand.relaxation.sweep import Flow, surge
 
 
 @dataclass(frozen=True)

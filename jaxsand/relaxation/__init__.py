@@ -1,0 +1,1 @@
+"""Sand flows to its angle of repose: fluxes, schemes, stop rules, settling."""
