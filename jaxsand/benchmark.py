@@ -34,6 +34,7 @@ from jaxsand import (
     workprec,
 )
 from jaxsand.files import as_table
+from jaxsand.interaction.simulate import act
 from jaxsand.letterbench import bench_letters
 from jaxsand.plain import compile_c, settle_numpy
 from jaxsand.relaxation._batching import cores
@@ -42,7 +43,6 @@ from jaxsand.relaxation.settling import Settled, settle, settle_batch
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.sim import act
 
 Tell = Callable[[str], None]
 _CELLS = 32

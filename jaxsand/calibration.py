@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxsand.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
+from jaxsand.interaction.simulate import Push, check_push, rollout
 from jaxsand.limit import Reference
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import settle
@@ -19,7 +20,6 @@ from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, concrete, fit
 from jaxsand.scene.tools import NoTool
-from jaxsand.sim import Push, check_push, rollout
 
 Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"

@@ -17,11 +17,11 @@ from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from jaxsand.env import LevelGoals, OnSand, Together, Walks, make, pool_of
+from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.relaxation._batching import wide_vectors
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.window import Whole
 from jaxsand.strokeloss import pushed
-from jaxsand.swath import SwathPush
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]

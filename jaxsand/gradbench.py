@@ -21,7 +21,7 @@ from jaxsand.gradcheck import (
     relative,
     sloped,
 )
-from jaxsand.push import SteppedPush
+from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
 from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.interaction.simulate import act, step
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import Stop, Sweeps
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window
-from jaxsand.sim import act, step
 
 Inputs = tuple[Any, Any, Any]
 """Heights [B, H, W] (m), strokes [B, 4] (m) and angles of repose [B] (rad)."""

@@ -19,19 +19,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.push import SteppedPush, push_along, with_near
-from jaxsand.pusher import step_batch, value_and_grad_batch
+from jaxsand.interaction._resting import Sand, no_flux
+from jaxsand.interaction._stencil import net, steps
+from jaxsand.interaction.batched import step_batch, value_and_grad_batch
+from jaxsand.interaction.blade_closed_form import SwathPush
+from jaxsand.interaction.blade_stepped import SteppedPush, push_along, with_near
+from jaxsand.interaction.simulate import follow_frames, step
 from jaxsand.relaxation._ghost_cells import truncate
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.settling import settle, settle_batch
-from jaxsand.resting import Sand, no_flux
 from jaxsand.scene.grid import links
 from jaxsand.scene.scene import Scene, cast, fit, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window
-from jaxsand.sim import follow_frames, step
-from jaxsand.stencil import net, steps
-from jaxsand.swath import SwathPush
 
 Tell = Callable[[str], None]
 _ANGLE = math.radians(29)

@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.push import SteppedPush
+from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.simulate import Push, check, step
+from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation._batching import cores
 from jaxsand.scans import Scan, compare, measured_profile
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
 from jaxsand.scene.window import Window
-from jaxsand.sim import Push, check, step
-from jaxsand.split import SplitPush
 from jaxsand.trench import Pass, Profile, closed_form, relaxed
 
 Tell = Callable[[str], None]

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.interaction.simulate import act
+from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation.schemes import Multilevel, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.rut import FIGURES, RULES, TRENCHES, errors, references, simulate_all
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
-from jaxsand.sim import act
-from jaxsand.split import SplitPush
 from jaxsand.trench import trimmed
 
 Tell = Callable[[str], None]

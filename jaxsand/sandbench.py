@@ -8,11 +8,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsand.interaction.simulate import step
 from jaxsand.sandplan import plan_sand, rivals
 from jaxsand.sandplan.actions import Job, Lattice, Steps, propose
 from jaxsand.sandplan.rollouts import distance, pushed, replay, roughly_pushed
 from jaxsand.sandplan.tasks import SAND_TASKS, SandTask, sand_task
-from jaxsand.sim import step
 
 Tell = Callable[[str], None]
 

@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand import goals, task
+from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.simulate import Shaped, act, check, follow_frames
 from jaxsand.optimise import Optimised
 from jaxsand.planner import Cell, connected_pieces, plan
-from jaxsand.push import SteppedPush
 from jaxsand.relaxation.settling import settle, steepest_slope
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.sandplan import SandPlan
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.sim import Shaped, act, check, follow_frames
 from jaxsand.stages import Planned
 
 Kind = Literal["map", "glyph", "image", "heights", "terrain"]

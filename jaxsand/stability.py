@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.interaction.simulate import rollout
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch, steepest_slope
 from jaxsand.relaxation.stopping import Outcome, UntilStill
@@ -17,7 +18,6 @@ from jaxsand.scene.boundaries import Draining, Walls
 from jaxsand.scene.grid import Neighbours, links
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.sim import rollout
 from jaxsand.task import volume_error
 
 Tell = Callable[[str], None]

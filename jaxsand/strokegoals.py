@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxsand import goals, task
+from jaxsand.interaction.simulate import check, rollout
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.shaping import terrain_surface
-from jaxsand.sim import check, rollout
 from jaxsand.strokeloss import SandLoss
 
 CELLS, SPACING = 32, 0.01

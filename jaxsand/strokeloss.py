@@ -10,7 +10,7 @@ from typing import Protocol
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.pusher import step_batch, value_and_grad_batch
+from jaxsand.interaction.batched import step_batch, value_and_grad_batch
 from jaxsand.scene.scene import Scene
 from jaxsand.task import fits
 

@@ -61,7 +61,7 @@ def test_six_calls_of_two_kinds_and_three_angles_trace_twice():
 
 
 def test_public_functions_trace_once_whatever_kind_of_number_is_given():
-    from jaxsand import sim
+    from jaxsand.interaction import simulate as sim
     from jaxsand.relaxation import settling
 
     for module, name in ((settling, "_settle"), (sim, "_follow")):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.pusher import act_batch
+from jaxsand.interaction.batched import act_batch
 
 QUICK = {"push": js.SteppedPush(1.0, 2), "stop": js.Sweeps(8)}
 SAND = js.make_scene((9, 9), 0.01, 0.5, tool=js.Blade(0.025, 0.015, 0.006))

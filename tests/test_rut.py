@@ -9,7 +9,7 @@ import pytest
 
 from jaxsand import rut, rutbench, scans
 from jaxsand.__main__ import main
-from jaxsand.push import SteppedPush
+from jaxsand.interaction.blade_stepped import SteppedPush
 
 FIXTURE = Path(__file__).parent / "data" / "synthetic_scans.csv"
 

@@ -9,9 +9,9 @@ import pytest
 import jaxsand as js
 from jaxsand import strokebench
 from jaxsand.__main__ import main
+from jaxsand.interaction.simulate import rollout
 from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.window import Window
-from jaxsand.sim import rollout
 from jaxsand.strokebench import reached, run_all
 from jaxsand.strokefigures import strokes_figure
 from jaxsand.strokegoals import letters_on_rough_sand, many_strokes, stroke_goal, turned_letters
@@ -106,7 +106,7 @@ def test_many_plans_at_once_leave_what_the_simulator_leaves(bar):
 def test_a_push_that_touches_its_window_is_pushed_again_on_the_whole_map(bar, monkeypatch):
     small = replace(bar.scene, window=Window((6, 6)))
     assert int(js.step_batch(small, bar.start[None], bar.strokes[:1]).outcome[0]) == Outcome.WINDOW_EDGE
-    monkeypatch.setattr("jaxsand.pusher.windows_for", lambda *_: [small])
+    monkeypatch.setattr("jaxsand.interaction.batched.windows_for", lambda *_: [small])
     after = SandLoss(bar.scene, bar.start, bar.goal).maps(bar.strokes[None])[0]
     np.testing.assert_allclose(after, bar.goal, atol=5e-7)
 

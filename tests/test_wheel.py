@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand import sim
+from jaxsand.interaction import simulate as sim
 from jaxsand.task import volume_error
 from jaxsand.trench import Pass, relaxed
 

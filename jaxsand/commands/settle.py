@@ -25,11 +25,11 @@ def run_settle(options: argparse.Namespace) -> None:
         jax.config.update("jax_enable_x64", True)
     elif heights.dtype.kind != "f":
         heights = heights.astype(np.float32)
+    from jaxsand.interaction.simulate import OutcomeError, check
     from jaxsand.relaxation import schemes
     from jaxsand.relaxation.settling import settle
     from jaxsand.relaxation.stopping import Outcome, UntilStill
     from jaxsand.scene.scene import make_scene
-    from jaxsand.sim import OutcomeError, check
     from jaxsand.task import volume_error
 
     if not np.all(np.isfinite(heights)):

@@ -24,7 +24,7 @@ from jaxsand.env.onmap import MapParams, MapState, OnMap
 from jaxsand.env.onsand import OnSand, SandParams, SandState
 from jaxsand.env.pushing import ByLength, Together
 from jaxsand.env.spaces import Box, Dict, Discrete
-from jaxsand.push import SteppedPush, with_near
+from jaxsand.interaction.blade_stepped import SteppedPush, with_near
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade

@@ -14,10 +14,10 @@ from jaxsand import task
 from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
 from jaxsand.env.pushing import Pushing
 from jaxsand.goals import stroke_list
+from jaxsand.interaction.simulate import check
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene
-from jaxsand.sim import check
 
 _TRIES = 16
 _GLYPH_MAP = 0.32  # m: the side of the map that the glyphs' square is given for

@@ -11,7 +11,7 @@ from jaxsand.env import episode
 from jaxsand.env.episode import Step
 from jaxsand.env.pushing import Batching, ByLength, Push
 from jaxsand.env.spaces import Box, Dict
-from jaxsand.push import SteppedPush
+from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of
 

@@ -12,11 +12,11 @@ from jaxsand.env.episode import Step
 from jaxsand.env.maps import MapGoals, Walks
 from jaxsand.env.onmap import MapParams, MapState, OnMap
 from jaxsand.env.spaces import Box, Dict, Discrete
-from jaxsand.push import SteppedPush
+from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.simulate import act
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Pose, coverage
 from jaxsand.shaping import Layout
-from jaxsand.sim import act
 
 
 @jax.tree_util.register_dataclass

@@ -22,11 +22,11 @@ from jax.custom_batching import custom_vmap
 from jax.flatten_util import ravel_pytree
 
 from jaxsand.autodiff.while_loop import first_order, split
-from jaxsand.push import SteppedPush
+from jaxsand.interaction.blade_closed_form import SwathPush
+from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.simulate import step
 from jaxsand.relaxation.stopping import Stop, check_whole
 from jaxsand.scene.scene import Scene, cast
-from jaxsand.sim import step
-from jaxsand.swath import SwathPush
 
 Push = SteppedPush | SwathPush
 Pushing = Callable[[Scene, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.pusher import act_batch, step_batch
+from jaxsand.interaction.batched import act_batch, step_batch
+from jaxsand.interaction.blade_closed_form import SwathPush
+from jaxsand.interaction.simulate import check, follow
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import Sweeps
 from jaxsand.sandplan.actions import Path
 from jaxsand.scene.scene import Scene
-from jaxsand.sim import check, follow
-from jaxsand.swath import SwathPush
 
 CHEAP = 1 / 12
 """What a rough push counts for, in full ones; `jaxsand bench sand` measures it."""

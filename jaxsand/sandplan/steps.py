@@ -3,11 +3,11 @@
 import jax
 import numpy as np
 
+from jaxsand.interaction.simulate import follow
 from jaxsand.relaxation.stopping import Outcome
 from jaxsand.sandplan.actions import Job, Path, corners
 from jaxsand.sandplan.rollouts import Effort, distance, distinct, marks, walked
 from jaxsand.scene.scene import Scene
-from jaxsand.sim import follow
 
 _MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 _GRAIN = 1 / 50  # of the largest height to change: what maps are told apart by

@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 
 from jaxsand import goals, task
+from jaxsand.interaction.simulate import check
 from jaxsand.relaxation.settling import settle
 from jaxsand.sandplan.actions import Actions, Lattice, Steps
 from jaxsand.sandplan.rollouts import replay
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.sim import check
 
 _SHAPE, _SPACING = (32, 32), 0.01
 

@@ -23,16 +23,16 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand.autodiff.while_loop import repeat, repeat_until
-from jaxsand.block import Block, Moving, Way
-from jaxsand.displace import Job
-from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
-from jaxsand.push import SteppedPush
-from jaxsand.resting import no_flux
-from jaxsand.rolling import Roll, Touchdown, Turn
+from jaxsand.interaction._block import Block, Moving, Way
+from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._resting import no_flux
+from jaxsand.interaction._rolling import Roll, Touchdown, Turn
+from jaxsand.interaction._wheel import Track
+from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, Smooth, carried_area, half_chord
 from jaxsand.scene.window import Window
-from jaxsand.wheel import Track
 
 
 def roll_along(

@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import wheel
-from jaxsand.advance import Step
 from jaxsand.autodiff.while_loop import Plain, repeat_until
-from jaxsand.block import First, Moving, View, pose_ahead
-from jaxsand.frame import Frame, frame_of, shifted
+from jaxsand.interaction import _wheel as wheel
+from jaxsand.interaction._advance import Step
+from jaxsand.interaction._block import First, Moving, View, pose_ahead
+from jaxsand.interaction._frame import Frame, frame_of, shifted
+from jaxsand.interaction._resting import bring_to_rest, where_open
+from jaxsand.interaction._turning import rotated
+from jaxsand.interaction._wheel import Stand, Track
 from jaxsand.relaxation._ghost_cells import at, truncate
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.resting import bring_to_rest, where_open
 from jaxsand.scene.tools import Pose
-from jaxsand.turning import rotated
-from jaxsand.wheel import Stand, Track
 
 Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)
 

@@ -12,8 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand.around import Beside
 from jaxsand.autodiff.while_loop import repeat
+from jaxsand.interaction._contact_sweeps import Beside
 from jaxsand.relaxation._ghost_cells import Bed, Lost, truncate
 from jaxsand.relaxation.flux import stand
 from jaxsand.relaxation.sweep import Flow

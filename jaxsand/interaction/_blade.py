@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.displace import EIGHT, shares
+from jaxsand.interaction._displacement import EIGHT, shares
+from jaxsand.interaction._stencil import both_ends, inner, outer, seen
 from jaxsand.relaxation._ghost_cells import at, truncate
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.scene.grid import Neighbours
-from jaxsand.stencil import both_ends, inner, outer, seen
 
 _LEAST = 1e-4
 SLIVER = 0.02  # in an open share below this sand stands no higher than it would in this one

@@ -29,10 +29,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxsand.interaction._stencil import both_ends, inner, net, outer, rises
 from jaxsand.relaxation._ghost_cells import nearest, truncate
 from jaxsand.relaxation.flux import Fluxes, ends
 from jaxsand.scene.grid import Neighbours, links
-from jaxsand.stencil import both_ends, inner, net, outer, rises
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open
 _CALM = 0.6  # of the rate: beyond this, gradients that start from a guess overshoot, now and then without end

@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.legs import Pushed
-from jaxsand.push import windows_for
+from jaxsand.interaction._path import Pushed
+from jaxsand.interaction.blade_stepped import windows_for
+from jaxsand.interaction.simulate import Push, Rules, Shaped, lifted, ready, step, way_of
 from jaxsand.relaxation._batching import in_groups, in_turns, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
 from jaxsand.relaxation.stopping import Outcome, Stop, as_batch, check_chunk
 from jaxsand.scene.scene import Scene, as_array
 from jaxsand.scene.window import Whole
-from jaxsand.sim import Push, Rules, Shaped, lifted, ready, step, way_of
 
 Array = jax.typing.ArrayLike
 Loss = Callable[..., jax.Array]

@@ -28,17 +28,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.displace import Job, contact, settle_around, take, whole
-from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
-from jaxsand.mound import Lean, heights, held, lean, reach_of, unbounded
-from jaxsand.overflow import Rim, nothing_beyond
+from jaxsand.interaction._displacement import Job, contact, settle_around, take, whole
+from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
+from jaxsand.interaction._overflow import Rim, nothing_beyond
+from jaxsand.interaction._path import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.interaction._shade import on_line, within_reach
+from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
 from jaxsand.relaxation._ghost_cells import Lost, lose
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, coverage, local
 from jaxsand.scene.window import Whole
-from jaxsand.shade import on_line, within_reach
-from jaxsand.slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
 
 # Shapes, fitted to SteppedPush.fine() with blades of 2 to 16 cells; lengths are shares of the reach r, or cells.
 _LAG = 1.23  # the heap holds more than that for its outflow: it is lower at its ends

@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import blade
 from jaxsand.autodiff.while_loop import Plain, split
-from jaxsand.block import Block, First, Moving, Stand, View, Way, pose_ahead
-from jaxsand.frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
+from jaxsand.interaction import _blade as blade
+from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way, pose_ahead
+from jaxsand.interaction._frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
+from jaxsand.interaction._resting import Links, Sand, bring_to_rest
+from jaxsand.interaction._resting_adjoint import Rested, blank, rest_pulled, rest_taped
+from jaxsand.interaction._stencil import inner, spread
 from jaxsand.relaxation._ghost_cells import at, halo
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.rested import Rested, blank, rest_pulled, rest_taped
-from jaxsand.resting import Links, Sand, bring_to_rest
-from jaxsand.stencil import inner, spread
 
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 

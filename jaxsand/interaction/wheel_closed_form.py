@@ -19,13 +19,13 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.displace import Job, whole
-from jaxsand.legs import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.interaction._displacement import Job, whole
+from jaxsand.interaction._path import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.interaction._slices import hat, wedge
+from jaxsand.interaction.blade_closed_form import ROOM, complete, typical_drop
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Grousers, Pose, Wheel, carried_area, half_chord, local, reach
 from jaxsand.scene.window import Whole
-from jaxsand.slices import hat, wedge
-from jaxsand.swath import ROOM, complete, typical_drop
 
 _SAMPLES = 8  # of the cut, along each side of a cell
 _TEN = math.radians(10)

@@ -7,14 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand import blade
-from jaxsand.advance import Rest, Step
-from jaxsand.block import Moving, Way
-from jaxsand.frame import Frame
+from jaxsand.interaction import _blade as blade
+from jaxsand.interaction._advance import Rest, Step
+from jaxsand.interaction._block import Moving, Way
+from jaxsand.interaction._frame import Frame
+from jaxsand.interaction._resting import bring_to_rest
+from jaxsand.interaction._stencil import inner
 from jaxsand.relaxation._ghost_cells import at
-from jaxsand.resting import bring_to_rest
 from jaxsand.scene.tools import Pose
-from jaxsand.stencil import inner
 
 
 @dataclass(frozen=True)

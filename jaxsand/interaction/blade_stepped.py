@@ -21,17 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.advance import Advance, Rest
 from jaxsand.autodiff.while_loop import repeat, repeat_until
-from jaxsand.block import SPARE, Block, Moving, Way
-from jaxsand.displace import Job
-from jaxsand.legs import Pushed, State, along_legs, over_the_map, turn_between
-from jaxsand.lowering import Lower
-from jaxsand.resting import bring_to_rest, no_flux
+from jaxsand.interaction._advance import Advance, Rest
+from jaxsand.interaction._block import SPARE, Block, Moving, Way
+from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._lowering import Lower
+from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._resting import bring_to_rest, no_flux
+from jaxsand.interaction._turning import Turn
 from jaxsand.scene.scene import Scene, concrete
 from jaxsand.scene.tools import Blade, Pose
 from jaxsand.scene.window import AsNeeded, Window
-from jaxsand.turning import Turn
 
 
 @jax.tree_util.register_dataclass

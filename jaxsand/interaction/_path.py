@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.displace import Job
+from jaxsand.interaction._displacement import Job
 from jaxsand.relaxation._ghost_cells import (
     Lost,
     halo,

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxsand.displace import Job
-from jaxsand.mound import Holds, distance
+from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._mound import Holds, distance
+from jaxsand.interaction._shade import between, inside, spot
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose
-from jaxsand.shade import between, inside, spot
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand import blade
-from jaxsand.advance import Step
 from jaxsand.autodiff.while_loop import Plain, repeat_until
-from jaxsand.block import Moving, Way
-from jaxsand.frame import frame_of
+from jaxsand.interaction import _blade as blade
+from jaxsand.interaction._advance import Step
+from jaxsand.interaction._block import Moving, Way
+from jaxsand.interaction._frame import frame_of
+from jaxsand.interaction._stencil import inner
 from jaxsand.relaxation._ghost_cells import at, truncate
-from jaxsand.stencil import inner
 
 
 @dataclass(frozen=True)

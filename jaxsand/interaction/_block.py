@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import blade
-from jaxsand.frame import Frame, Places, cut, numbers, paste, places
+from jaxsand.interaction import _blade as blade
+from jaxsand.interaction._frame import Frame, Places, cut, numbers, paste, places
+from jaxsand.interaction._resting import Sand, where_open
+from jaxsand.interaction._stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation._ghost_cells import Lost, at, halo, lose, nearest
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.resting import Sand, where_open
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.tools import Pose
-from jaxsand.stencil import both_ends, inner, put, spread, window
 
 SPARE = 1  # cells: the margin of a block in which sand must not move, for then none beyond would have
 _CELLS = 8_192  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache

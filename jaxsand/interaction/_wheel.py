@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand import blade
-from jaxsand.block import Block, First, View, Way
-from jaxsand.frame import Frame
+from jaxsand.interaction import _blade as blade
+from jaxsand.interaction._block import Block, First, View, Way
+from jaxsand.interaction._frame import Frame
+from jaxsand.interaction._resting import Sand
+from jaxsand.interaction._stencil import both_ends, inner, outer, seen, spread
 from jaxsand.relaxation._ghost_cells import at, truncate
 from jaxsand.relaxation.flux import NARROW, Fluxes
-from jaxsand.resting import Sand
 from jaxsand.scene.grid import Neighbours
-from jaxsand.stencil import both_ends, inner, outer, seen, spread
 
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it
 _PASSES = 4  # how many cells sand under the wheel moves on in a sub-step

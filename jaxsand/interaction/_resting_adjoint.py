@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxsand.interaction._resting import Links
+from jaxsand.interaction._stencil import inner, net, outer, rises, steps, total
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.resting import Links
-from jaxsand.stencil import inner, net, outer, rises, steps, total
 
 
 @jax.tree_util.register_dataclass

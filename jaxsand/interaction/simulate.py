@@ -8,16 +8,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsand.legs import Pushed
-from jaxsand.push import SteppedPush, push_along, windows_for, with_near
+from jaxsand.interaction._path import Pushed
+from jaxsand.interaction.blade_closed_form import SwathPush, push_swath
+from jaxsand.interaction.blade_stepped import SteppedPush, push_along, windows_for, with_near
+from jaxsand.interaction.wheel_closed_form import SplitPush, push_split
+from jaxsand.interaction.wheel_stepped import roll_along
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rate, check_rule, check_whole
-from jaxsand.roll import roll_along
 from jaxsand.scene.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.scene.tools import Blade, NoTool, Pose, Wheel
-from jaxsand.split import SplitPush, push_split
-from jaxsand.swath import SwathPush, push_swath
 
 Push = SteppedPush | SwathPush | SplitPush
 _PUSHES: dict[tuple[type, type], Any] = {
