@@ -14,10 +14,10 @@ from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation.schemes import Multilevel, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
-from jaxsand.rut import FIGURES, RULES, TRENCHES, errors, references, simulate_all
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
-from jaxsand.trench import trimmed
+from jaxsand.terramechanics.trench_experiment import FIGURES, RULES, TRENCHES, errors, references, simulate_all
+from jaxsand.terramechanics.wheel_trench import trimmed
 
 Tell = Callable[[str], None]
 SPACINGS = (4e-3, 2e-3, 1e-3, 5e-4)

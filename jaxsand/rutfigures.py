@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxsand.rut import ANGLES, SINKAGES, Trench, distances
-from jaxsand.trench import Profile
+from jaxsand.terramechanics.trench_experiment import ANGLES, SINKAGES, Trench, distances
+from jaxsand.terramechanics.wheel_trench import Profile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

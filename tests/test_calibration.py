@@ -9,8 +9,8 @@ import pytest
 
 import jaxsand as js
 from jaxsand.calibbench import bench_calibrate, bench_cone, cone
-from jaxsand.fitting import Range, climb, conclude, spread
-from jaxsand.trench import Pass, closed_form, relaxed
+from jaxsand.terramechanics._least_squares import Range, climb, conclude, spread
+from jaxsand.terramechanics.wheel_trench import Pass, closed_form, relaxed
 
 SHAPE, DX, NOISE = (32, 32), 0.01, 6e-4
 STROKE = np.array([0.08, 0.12, 0.24, 0.2], np.float32)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.forces import (
+from jaxsand.terramechanics.forces import (
     LETE_SAND,
     WONG_DRY_SAND,
     Cut,

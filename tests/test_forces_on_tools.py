@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from scipy.special import beta
 
 import jaxsand as js
-from jaxsand.forces import (
+from jaxsand.terramechanics.forces import (
     LETE_SAND,
     WONG_DRY_SAND,
     Cut,

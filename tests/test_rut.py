@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsand import rut, rutbench, scans
+from jaxsand import rutbench
 from jaxsand.__main__ import main
 from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.terramechanics import scans
+from jaxsand.terramechanics import trench_experiment as rut
 
 FIXTURE = Path(__file__).parent / "data" / "synthetic_scans.csv"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsand import scans
-from jaxsand.trench import Pass, closed_form
+from jaxsand.terramechanics import scans
+from jaxsand.terramechanics.wheel_trench import Pass, closed_form
 from tests.conftest import MU
 
 FIXTURE = Path(__file__).parent / "data" / "synthetic_scans.csv"

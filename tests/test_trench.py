@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxsand as js
-from jaxsand.trench import Pass, Profile, cell_means, closed_form, relaxed, unsettled
+from jaxsand.terramechanics.wheel_trench import Pass, Profile, cell_means, closed_form, relaxed, unsettled
 
 from .conftest import ANGLE, MU
 

@@ -11,7 +11,7 @@ import pytest
 import jaxsand as js
 from jaxsand.interaction import simulate as sim
 from jaxsand.task import volume_error
-from jaxsand.trench import Pass, relaxed
+from jaxsand.terramechanics.wheel_trench import Pass, relaxed
 
 from .conftest import ANGLE, MU, turned
 

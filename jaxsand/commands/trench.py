@@ -20,8 +20,8 @@ def run_trench(options: argparse.Namespace) -> None:
     for file in files:
         if file.is_dir():
             raise ValueError(f"out: cannot write {file}, which is a folder; choose another folder")
-    from jaxsand import rut
-    from jaxsand.scans import read_scans
+    from jaxsand.terramechanics import trench_experiment as rut
+    from jaxsand.terramechanics.scans import read_scans
 
     scans = read_scans(options.measured) if options.measured else {}
     rut.check_scans(scans)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.limit import Reference, seek_limit
+from jaxsand.terramechanics._limit import Reference, seek_limit
 
 Model = TypeVar("Model")
 _LOOKS = 40

@@ -10,16 +10,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
-from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
 from jaxsand.interaction.simulate import Push, check_push, rollout
-from jaxsand.limit import Reference
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, concrete, fit
 from jaxsand.scene.tools import NoTool
+from jaxsand.terramechanics._finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
+from jaxsand.terramechanics._least_squares import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
+from jaxsand.terramechanics._limit import Reference
 
 Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"

@@ -20,11 +20,11 @@ from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import Push, check, step
 from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation._batching import cores
-from jaxsand.scans import Scan, compare, measured_profile
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
 from jaxsand.scene.window import Window
-from jaxsand.trench import Pass, Profile, closed_form, relaxed
+from jaxsand.terramechanics.scans import Scan, compare, measured_profile
+from jaxsand.terramechanics.wheel_trench import Pass, Profile, closed_form, relaxed
 
 Tell = Callable[[str], None]
 Trench = tuple[float, float]  # slip angle (degrees), sinkage (mm)

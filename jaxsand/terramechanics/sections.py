@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from jaxsand.fitting import Calibration, Range, as_ranges, check_noise, conclude, spread
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.trench import Pass, Profile, relaxing
+from jaxsand.terramechanics._least_squares import Calibration, Range, as_ranges, check_noise, conclude, spread
+from jaxsand.terramechanics.wheel_trench import Pass, Profile, relaxing
 
 _SHARED = ("repose_angle", "radius", "width")
 _PLACE = {"shift": 0.005, "lift": 0.003, "tilt": 0.05}  # m, m, rad: either way

@@ -1,0 +1,1 @@
+"""Closed forms, forces, scans and calibration."""

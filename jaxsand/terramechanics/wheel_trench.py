@@ -1,0 +1,279 @@
+"""The trench of a towed wheel in closed form, and its exact relaxation.
+
+Pavlov & Johnson, Soil Displacement Terramechanics for Wheel-Based Trenching with a Planetary Rover (ICRA 2019). A wheel of
+radius r and width b is dragged at sinkage h, its plane at the slip angle beta to its way. With t = tan(angle of repose),
+s = sqrt(2 r h - h^2) half its chord in the sand and p = b cos(beta), it sweeps a cut w = p + 2 s sin(beta) wide: a floor of
+width p at depth h between two flanks (w - p) / 2 wide, parabolas of area A = (w - p) h / 3 each.
+
+Before the sand flows, what was in the cut stands beside it in two right triangles, steep against the cut: alike, or, when
+the wheel's flank takes more than its rim (2 A > h p) and beta is 10 degrees and more from 0 and from 90, 2 A on the left and
+h p on the right. The piles jump with beta where the 10 degrees decide, not at 2 A = h p, where the two rules agree. After
+the sand has flowed, all faces lie at repose, the outer toes stay where they were, and the sand of the left and of the right
+pile part where the rim's cut ends; below 10 degrees in the middle, so that pointed profiles jump there.
+
+Heights and places are in metres, x to the right across the way, 0 at the middle of the cut; angles are in radians.
+"""
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import brentq
+
+from jaxsand.relaxation.schemes import SuperTimeStepping
+from jaxsand.relaxation.settling import settle_batch
+from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.scene.scene import make_scene
+
+_TEN = math.radians(10)
+
+
+@dataclass(frozen=True)
+class Pass:
+    """A wheel's pass: slip angle beta (0 to pi/2), sinkage, wheel and sand. Lengths in m, angles in rad.
+
+    `spin` is the rim's speed over the wheel's, r omega / v: 0 for a wheel that is towed without turning, 1 / (1 - i) for one
+    driven at the slip ratio i. Its grousers, `grouser_height` high, of which sand fills the share `grouser_fill`, take
+    spin b h_g zeta of the section along and leave it behind the wheel.
+    """
+
+    slip_angle: float
+    sinkage: float
+    radius: float = 0.048
+    width: float = 0.05
+    repose_angle: float = math.radians(29)
+    spin: float = 0.0
+    grouser_height: float = 0.005
+    grouser_fill: float = 0.1
+
+    def __post_init__(self) -> None:
+        _within("slip_angle", self.slip_angle, 0, math.pi / 2, "rad from 0 to pi/2")
+        for name in ("radius", "width"):
+            _above(name, getattr(self, name), "metres above 0")
+        _above("repose_angle", self.repose_angle, "rad between 0 and pi/2")
+        _within("repose_angle", self.repose_angle, 0, math.pi / 2 * (1 - 1e-9), "rad between 0 and pi/2")
+        _within("sinkage", self.sinkage, 0, self.radius, "metres from 0 to the wheel's radius")
+        for name in ("spin", "grouser_height", "grouser_fill"):
+            _within(name, getattr(self, name), 0, sys.float_info.max, "a finite number of 0 or more")
+
+    @property
+    def slope(self) -> float:
+        return math.tan(self.repose_angle)
+
+    @property
+    def rim(self) -> float:
+        """The width p of the rim's cut (m)."""
+        return self.width * math.cos(self.slip_angle)
+
+    @property
+    def flank(self) -> float:
+        """The width of each of the cut's flanks, (w - p) / 2 = s sin(beta) (m)."""
+        return math.sqrt(max(2 * self.radius * self.sinkage - self.sinkage**2, 0)) * math.sin(self.slip_angle)
+
+    @property
+    def swept(self) -> float:
+        """The width w of the cut (m)."""
+        return self.rim + 2 * self.flank
+
+    @property
+    def carried(self) -> float:
+        """The area (m^2) that the grousers leave behind the wheel, as far as there is a pile to take it from."""
+        asked = self.spin * self.width * self.grouser_height * self.grouser_fill
+        left, right = self._displaced()
+        return min(asked, right if self.parted else left + right)
+
+    @property
+    def parted(self) -> bool:
+        """Whether the flank's sand goes to one side and the rim's to the other."""
+        beta, flanks = self.slip_angle, 2 * self._flank_area()
+        return not (beta < _TEN or abs(beta - math.pi / 2) < _TEN or flanks <= self.sinkage * self.rim)
+
+    def piles(self) -> tuple[float, float]:
+        """The areas (m^2) of the left and the right pile before the sand flows; grousers take from what the rim pushes."""
+        left, right = self._displaced()
+        if self.parted:
+            return left, right - self.carried
+        return left - self.carried / 2, right - self.carried / 2
+
+    def _displaced(self) -> tuple[float, float]:
+        flanks, rim = 2 * self._flank_area(), self.sinkage * self.rim
+        return (flanks, rim) if self.parted else ((flanks + rim) / 2, (flanks + rim) / 2)
+
+    def _flank_area(self) -> float:
+        return 2 / 3 * self.flank * self.sinkage
+
+    def floor(self) -> float:
+        """The depth of the cut's floor (m) when what the grousers leave behind lies level in it."""
+        filled = self.carried
+        if filled == 0:
+            return self.sinkage
+
+        def short(inside: float) -> float:
+            return self.sinkage * (self.rim * inside**2 + 4 / 3 * self.flank * inside**3) - filled
+
+        # In the share of a flank that is filled, which is as well resolved at any sinkage.
+        inside = float(brentq(short, 0.0, 1.0, xtol=1e-16, rtol=1e-15)) if short(1.0) > 0 else 1.0
+        return self.sinkage * (1 - inside**2)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A section: heights `z` at places `x` (m, rising), straight between them, level sand at 0 beyond."""
+
+    x: np.ndarray
+    z: np.ndarray
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        return np.interp(x, self.x, self.z, left=0.0, right=0.0)
+
+    @property
+    def toes(self) -> tuple[float, float]:
+        """Where the profile leaves the level sand."""
+        return float(self.x[0]), float(self.x[-1])
+
+    @property
+    def deepest(self) -> float:
+        """How deep the deepest point lies below the level sand."""
+        return -float(self.z.min())
+
+    @property
+    def peaks(self) -> tuple[float, float]:
+        """The highest points left and right of the deepest."""
+        low = int(self.z.argmin())
+        return float(self.z[: low + 1].max()), float(self.z[low:].max())
+
+    def area(self) -> float:
+        """What lies above level less what is missing below it (m^2)."""
+        return float(np.trapezoid(self.z, self.x))
+
+
+def closed_form(run: Pass) -> Profile:
+    """The settled section, all faces at repose: toe, peak, foot, foot, peak, toe.
+
+    Pointed while that is no deeper than the cut's floor: with u = h_L1 + (w + p) t / 2 and v = h_R1 + (w - p) t / 2, h_1 the
+    piles' heights before the flow, its depth d solves -2 d^2 - 2 (u + v) d + u^2 + v^2 = 0 and the peaks are (u - d) / 2 and
+    (v - d) / 2; for beta < 10 degrees the deepest point lies in the middle. Else flat, at the depth of the cut's floor, and
+    each peak x solves x^2 + 2 h x + h^2 / 2 - h h_1 - h_1^2 / 2 - (w - p) h t / 6 = 0. With grousers the same balance is
+    drawn up for a cut filled level to the depth of `Pass.floor`.
+
+    Raises:
+      ValueError: where the closed form breaks down: a pile would end below the level sand, or a floor be narrower than
+        nothing (where pointed and flat profiles meet; of the source's wheel and sand 2% of all slip angles and sinkages).
+    """
+    t, w, p = run.slope, run.swept, run.rim
+    left, right = (math.sqrt(2 * t * area) for area in run.piles())
+    toes = -w / 2 - left / t, w / 2 + right / t
+    middle = 0.0 if run.slip_angle < _TEN else p / 2
+    u, v = (middle - toes[0]) * t, (toes[1] - middle) * t
+    depth = (u * u + v * v) / (u + v + math.sqrt((u + v) ** 2 + 2 * (u * u + v * v))) if u + v > 0 else 0.0
+    if depth <= run.floor():
+        peaks = (u - depth) / 2, (v - depth) / 2
+    else:
+        depth = run.floor()
+        peaks = _beside_a_floor(run, depth, left), _beside_a_floor(run, depth, right)
+    feet = toes[0] + (2 * peaks[0] + depth) / t, toes[1] - (2 * peaks[1] + depth) / t
+    if min(peaks) < -1e-12 or feet[1] - feet[0] < -1e-9:
+        raise ValueError(
+            f"slip_angle: got {math.degrees(run.slip_angle):.4g} degrees at a sinkage of {run.sinkage * 1e3:.4g} mm, where "
+            "the closed form has no profile (its faces would cross, or a pile end below the level sand); use relaxed instead"
+        )
+    x = [toes[0], toes[0] + peaks[0] / t, feet[0], max(feet), toes[1] - peaks[1] / t, toes[1]]
+    return Profile(np.array(x), np.array([0.0, peaks[0], -depth, -depth, peaks[1], 0.0]))
+
+
+def _beside_a_floor(run: Pass, depth: float, pile: float) -> float:
+    """The height of the peak beside a flat floor: what the pile and the flank hold keeps its area."""
+    inside = _inside(run, depth)
+    cut = run.flank * run.sinkage * ((1 - inside) - (1 - inside**3) / 3)
+    spare = run.slope * (depth * run.flank * (1 - inside) - cut)
+    return math.sqrt(depth * depth / 2 + depth * pile + pile * pile / 2 + spare) - depth
+
+
+def _inside(run: Pass, depth: float) -> float:
+    """The share of a flank's width, from the rim's cut, that is deeper than `depth`."""
+    return math.sqrt(max(1 - depth / run.sinkage, 0.0)) if run.sinkage else 0.0
+
+
+def unsettled(run: Pass) -> Profile:
+    """The section before the sand flows: the cut, and a pile on each side, steep against it. Faces of no width are kept."""
+    t, w = run.slope, run.swept
+    left, right = (math.sqrt(2 * t * area) for area in run.piles())
+    eta = np.linspace(1, _inside(run, run.floor()), 201)
+    # The chords of a parabola lie above it; lowered by as much, they hold its area.
+    flank = -run.sinkage * (1 - eta**2 + (eta[1] - eta[0]) ** 2 / 6)
+    out = run.rim / 2 + run.flank * eta
+    x: list[Any] = [[-w / 2 - left / t, -w / 2], -out, [-out[-1], out[-1]], out[::-1], [w / 2, w / 2 + right / t]]
+    z: list[Any] = [[0, left], flank, [-run.floor(), -run.floor()], flank[::-1], [right, 0]]
+    return Profile(np.concatenate(x), np.concatenate(z))
+
+
+def cell_means(profile: Profile, edges: np.ndarray) -> np.ndarray:
+    """The mean height of a profile, jumps and all, between neighbouring `edges`."""
+    x, z = profile.x, profile.z
+    whole = np.concatenate([[0], np.cumsum(np.diff(x) * (z[1:] + z[:-1]) / 2)])
+    k = np.clip(np.searchsorted(x, edges, side="right") - 1, 0, len(x) - 2)
+    run = np.clip(edges, x[0], x[-1]) - x[k]
+    width = x[k + 1] - x[k]
+    slope = np.where(width > 0, (z[k + 1] - z[k]) / np.where(width > 0, width, 1), 0)
+    return np.diff(whole[k] + run * (z[k] + slope * run / 2)) / np.diff(edges)
+
+
+def relaxed(runs: list[Pass], spacing: float = 5e-4) -> list[Profile]:
+    """What sand in one dimension makes of the unsettled sections (all of one angle of repose), in the limit of small steps.
+
+    Computed in float64 on cells of `spacing` (m), which is where the error is: about mu spacing / 2 at a corner.
+    """
+    if len({run.repose_angle for run in runs}) != 1:
+        angles = sorted({run.repose_angle for run in runs})
+        raise ValueError(f"runs: got repose angles {angles}; give at least one run, all of one angle")
+    reach = max(abs(end) for run in runs for end in unsettled(run).toes) * 1.1 + 10 * spacing
+    return _relaxed(runs, reach, spacing)
+
+
+def relaxing(reach: float = 0.2, spacing: float = 1e-3) -> Callable[[Pass], Profile]:
+    """`relaxed` for one pass after the other, on cells of `spacing` (m) as far as `reach` (m) to either side."""
+
+    def relax(run: Pass) -> Profile:
+        if max(map(abs, unsettled(run).toes)) > reach - 10 * spacing:
+            raise ValueError(f"reach: got {reach!r} m, too little for a sinkage of {run.sinkage * 1e3:.4g} mm; give more")
+        return _relaxed([run], reach, spacing)[0]
+
+    return relax
+
+
+def _relaxed(runs: list[Pass], reach: float, spacing: float) -> list[Profile]:
+    half = math.ceil(reach / spacing)
+    edges = (np.arange(-half, half + 2) - 0.5) * spacing
+    start = np.stack([cell_means(unsettled(run), edges) for run in runs])[:, None, :]
+    with jax.enable_x64(True):
+        scene = make_scene((1, 2 * half + 1), spacing, runs[0].repose_angle, 4)
+        stop = UntilStill(1e-6, bound=2_000_000)
+        end = settle_batch(scene, jnp.asarray(start, jnp.float64), scheme=SuperTimeStepping(0.05, 1 / 64), stop=stop)
+        heights = np.asarray(end.height)[:, 0]
+    x = (edges[1:] + edges[:-1]) / 2
+    return [trimmed(Profile(x, z), 1e-9 * float(np.abs(z).max())) for z in heights]
+
+
+def trimmed(profile: Profile, least: float) -> Profile:
+    """The profile from toe to toe, where it is more than `least` (m) off level."""
+    x, z = profile.x, profile.z
+    moved = np.flatnonzero(np.abs(z) > least)
+    if not moved.size:
+        return Profile(x[[0, -1]], z[[0, -1]])
+    part = slice(max(moved[0] - 1, 0), moved[-1] + 2)
+    return Profile(x[part], z[part])
+
+
+def _within(name: str, value: float, least: float, most: float, what: str) -> None:
+    if not least <= value <= most:
+        raise ValueError(f"{name}: got {value!r}; give {what}")
+
+
+def _above(name: str, value: float, what: str) -> None:
+    if not (value > 0 and math.isfinite(value)):
+        raise ValueError(f"{name}: got {value!r}; give {what}")
