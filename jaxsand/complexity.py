@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand import goals
+from jaxsand.goals import letters as goals
 from jaxsand.planner import Cell, Plan, plan
 from jaxsand.planner.paper import ALPHA
 

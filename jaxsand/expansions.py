@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.goals import letter_map
+from jaxsand.goals.letters import letter_map
 from jaxsand.planner.frontier import Bound, layered, misdug, two_colours
 from jaxsand.planner.graph import Graph, goal_only, with_margin
 

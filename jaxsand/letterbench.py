@@ -4,7 +4,7 @@ import string
 from collections.abc import Callable
 from typing import Any
 
-from jaxsand import goals
+from jaxsand.goals import letters as goals
 from jaxsand.shaping import Layout, glyph_target, map_target, shape
 
 Tell = Callable[[str], None]

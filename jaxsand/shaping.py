@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import goals, task
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import Shaped, act, check, follow_frames
 from jaxsand.optimise import Optimised

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.goals.metrics import volume_error
 from jaxsand.interaction.simulate import rollout
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch, steepest_slope
@@ -18,7 +19,6 @@ from jaxsand.scene.boundaries import Draining, Walls
 from jaxsand.scene.grid import Neighbours, links
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.task import volume_error
 
 Tell = Callable[[str], None]
 VOLUME = {"float16": 2e-3, "float32": 1e-6, "float64": 1e-12}  # the largest volume error

@@ -10,9 +10,9 @@ from typing import Protocol
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.goals.metrics import fits
 from jaxsand.interaction.batched import step_batch, value_and_grad_batch
 from jaxsand.scene.scene import Scene
-from jaxsand.task import fits
 
 GRADIENT = 4
 """Calls that going back through one stroke costs, as `jaxsand bench grad` measures it, rounded up."""

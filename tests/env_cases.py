@@ -7,8 +7,8 @@ import numpy as np
 
 import jaxsand as js
 from jaxsand import env as envs
-from jaxsand import goals
 from jaxsand.env.pushing import Together
+from jaxsand.goals import letters as goals
 
 KEY = jax.random.key(0)
 LETTERS = envs.map_pool([goals.letter_map(name)[0] for name in "ALTR"])

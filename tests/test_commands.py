@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from jaxsand.__main__ import main
-from jaxsand.task import volume_error
+from jaxsand.goals.metrics import volume_error
 
 L_MAP = "#..\n#..\n###\n"
 
@@ -262,7 +262,7 @@ def test_the_policy_looks_ahead(here, capsys):
     "goal", ["dip.npy", "7", *(pytest.param(name, marks=pytest.mark.slow) for name in ("white-S.png", "terrain"))]
 )
 def test_other_goals(here, capsys, goal):
-    from jaxsand.goals import letter_map
+    from jaxsand.goals.letters import letter_map
 
     Image.fromarray(np.kron(np.where(letter_map("S")[0], 0, 255), np.ones((6, 6))).astype(np.uint8)).save(
         here / "white-S.png"

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsand import goals
 from jaxsand.env.maps import STEPS, map_pool
 from jaxsand.env.onmap import MapParams, OnMap
+from jaxsand.goals import letters as goals
 from train.backup import Every, Items, Sampled, items_of
 from train.dqn import Dqn, begin, practise
 from train.dqn_tasks import Asking, SingleStroke

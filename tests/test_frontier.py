@@ -9,7 +9,7 @@ import pytest
 
 import jaxsand as js
 from jaxsand.expansions import heap_misdug, heap_two_colours
-from jaxsand.goals import letter_map
+from jaxsand.goals.letters import letter_map
 from jaxsand.planner import connected_pieces, frontier
 from jaxsand.planner.frontier import layered, misdug, two_colours
 from jaxsand.planner.graph import goal_only, grid_near, make_graph, with_margin

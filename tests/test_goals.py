@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxsand import goals, task
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
 
 
 def test_letters():

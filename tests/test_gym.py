@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 
 import jaxsand.gym
 from jaxsand.env import LevelGoals, OnlyDug, OnSand, Stop, Together, map_pool
-from jaxsand.goals import letter_map
+from jaxsand.goals.letters import letter_map
 from jaxsand.interaction.blade_stepped import SteppedPush
 
 POOL = map_pool([letter_map(name)[0] for name in "LT"])

@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
+from jaxsand.goals.metrics import GLYPH_SQUARE
 from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.strokegoals import CELLS, SPACING, usual_scene
 from jaxsand.strokeloss import pushed
-from jaxsand.task import GLYPH_SQUARE
 from train.hindsight import Hindsight, _labels, _pairs, _turned
 from train.lessons import lessons
 from train.plans import MOST, anywhere, random_plans

@@ -9,8 +9,9 @@ import pytest
 
 import jaxsand as js
 from jaxsand import env as envs
-from jaxsand import goals, task
 from jaxsand.env.pushing import ByLength
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
 from jaxsand.relaxation.settling import steepest_slope
 
 from .conftest import MU

@@ -10,7 +10,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 import jaxsand as js
 from jaxsand import complexity
-from jaxsand.goals import letter_map
+from jaxsand.goals.letters import letter_map
 from jaxsand.planner import connected_pieces, make_problem, relaxed
 from jaxsand.planner.anytime import nearest_first, simple_bound
 from jaxsand.planner.board import MOVES, blocks_of

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.goals.metrics import volume_error
 from jaxsand.scene.grid import centres
 from jaxsand.scene.tools import coverage
-from jaxsand.task import volume_error
 
 from .conftest import ANGLE, MU, turned
 

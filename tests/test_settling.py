@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxsand as js
-from jaxsand.task import volume_error
+from jaxsand.goals.metrics import volume_error
 
 from .conftest import ANGLE, MU
 

@@ -5,8 +5,10 @@ import string
 import numpy as np
 import pytest
 
-from jaxsand import goals, shaping, task
-from jaxsand.task import volume_error
+from jaxsand import shaping
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
+from jaxsand.goals.metrics import volume_error
 
 
 def shape(target, before=None):

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from jaxsand.goals.layout import right, strict, strokes_right
 from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import letters
 from jaxsand.strokeloss import SandLoss
-from jaxsand.success import right, strict, strokes_right
 
 DEPTH = float(Blade().depth)
 E = letters("E")[0]  # four strokes

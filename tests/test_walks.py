@@ -8,7 +8,8 @@ import numpy as np
 
 import jaxsand as js
 from jaxsand import env as envs
-from jaxsand import goals, task
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
 
 from .env_cases import KEY, one_map, program
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.goals.metrics import volume_error
 from jaxsand.interaction import simulate as sim
-from jaxsand.task import volume_error
 from jaxsand.terramechanics.wheel_trench import Pass, relaxed
 
 from .conftest import ANGLE, MU, turned

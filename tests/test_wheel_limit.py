@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.task import volume_error
+from jaxsand.goals.metrics import volume_error
 
 from .conftest import ANGLE, MU, half_turn
 

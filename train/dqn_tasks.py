@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import goals
 from jaxsand.env.maps import MapPool
 from jaxsand.env.onmap import MapParams, MapState, OnMap
+from jaxsand.goals import letters as goals
 from train.evaluate_maps import fewest, walks
 from train.probes import Probe, ProbeState, Two
 from train.qnet import Greedy, around, flat

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxsand import task
+from jaxsand.goals import metrics as task
+from jaxsand.goals.layout import right, strict, strokes_right
 from jaxsand.lookahead import Proposes
 from jaxsand.stages import Stages, plan_by_policy
 from jaxsand.strokefigures import found_figure
 from jaxsand.strokegoals import StrokeGoal
-from jaxsand.success import right, strict, strokes_right
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

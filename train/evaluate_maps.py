@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand import goals
 from jaxsand.env.maps import STEPS, MapPool, map_pool
 from jaxsand.env.onmap import MapParams, OnMap
+from jaxsand.goals import letters as goals
 from jaxsand.planner import Cell, plan
 from train.qnet import Greedy, best, of
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsand import goals, task
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import CELLS, SPACING, StrokeGoal, letters, letters_on_rough_sand, stroke_goal, turned_letters

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxsand.task import GLYPH_SQUARE
+from jaxsand.goals.metrics import GLYPH_SQUARE
 
 MOST = 8
 """Strokes of a plan, at most."""

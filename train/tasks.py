@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import task
 from jaxsand.env.library import RandomStrokes
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
+from jaxsand.goals import metrics as task
+from jaxsand.goals.layout import right
 from jaxsand.lookahead import one_after_the_other
 from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import usual_scene
 from jaxsand.strokeloss import pushed
-from jaxsand.success import right
 from train.actor import Acts
 from train.probes import Probe
 

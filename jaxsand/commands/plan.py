@@ -10,7 +10,7 @@ from jaxsand.files import folder, progress, read_text, write_json, written
 
 def run_plan(options: argparse.Namespace) -> None:
     tell = progress()
-    from jaxsand import goals
+    from jaxsand.goals import letters as goals
     from jaxsand.planner import plan
 
     own: tuple[int, int] | None

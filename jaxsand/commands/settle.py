@@ -15,7 +15,7 @@ def run_settle(options: argparse.Namespace) -> None:
     tell = progress()
     if options.out_file.suffix != ".npy":
         raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")
-    from jaxsand import goals
+    from jaxsand.goals import letters as goals
 
     heights = goals.read_heights(existing(options.input))
     import jax
@@ -25,12 +25,12 @@ def run_settle(options: argparse.Namespace) -> None:
         jax.config.update("jax_enable_x64", True)
     elif heights.dtype.kind != "f":
         heights = heights.astype(np.float32)
+    from jaxsand.goals.metrics import volume_error
     from jaxsand.interaction.simulate import OutcomeError, check
     from jaxsand.relaxation import schemes
     from jaxsand.relaxation.settling import settle
     from jaxsand.relaxation.stopping import Outcome, UntilStill
     from jaxsand.scene.scene import make_scene
-    from jaxsand.task import volume_error
 
     if not np.all(np.isfinite(heights)):
         raise ValueError(f"{options.input}: got {np.sum(~np.isfinite(heights))} cells that are not finite; fill them first")

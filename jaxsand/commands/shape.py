@@ -149,7 +149,8 @@ def _summary(report: dict[str, Any]) -> str:
 
 
 def _target(options: argparse.Namespace) -> "Target":
-    from jaxsand import goals, shaping
+    from jaxsand import shaping
+    from jaxsand.goals import letters as goals
 
     name, method = options.goal, options.method
     path = Path(name)
@@ -210,7 +211,8 @@ def _cells(options: argparse.Namespace) -> int:
 
 
 def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | None":
-    from jaxsand import goals, shaping
+    from jaxsand import shaping
+    from jaxsand.goals import letters as goals
 
     if options.surface == "level":
         return None

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from jaxsand import task
 from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
 from jaxsand.env.pushing import Pushing
-from jaxsand.goals import stroke_list
+from jaxsand.goals import metrics as task
+from jaxsand.goals.letters import stroke_list
 from jaxsand.interaction.simulate import check
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill

@@ -6,11 +6,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand import task
 from jaxsand.env import episode
 from jaxsand.env.episode import Step
 from jaxsand.env.pushing import Batching, ByLength, Push
 from jaxsand.env.spaces import Box, Dict
+from jaxsand.goals import metrics as task
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of

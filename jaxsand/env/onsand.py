@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand import task
 from jaxsand.env import episode
 from jaxsand.env.episode import Step
 from jaxsand.env.maps import MapGoals, Walks
 from jaxsand.env.onmap import MapParams, MapState, OnMap
 from jaxsand.env.spaces import Box, Dict, Discrete
+from jaxsand.goals import metrics as task
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import act
 from jaxsand.scene.scene import Scene, blade_of

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from jaxsand import task
+from jaxsand.goals import metrics as task
 from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.sandplan.actions import Actions, Job, Lattice, Path, Steps, longest_stroke

@@ -6,7 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from jaxsand import goals, task
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
 from jaxsand.interaction.simulate import check
 from jaxsand.relaxation.settling import settle
 from jaxsand.sandplan.actions import Actions, Lattice, Steps

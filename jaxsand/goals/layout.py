@@ -5,7 +5,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.optimize import linear_sum_assignment
 
-from jaxsand.task import GLYPH_SQUARE, dug, iou, l2
+from jaxsand.goals.metrics import GLYPH_SQUARE, dug, iou, l2
 
 _NEAR = 0.9  # of the dug cells of either map lie beside a dug cell of the other
 _CLOSE = 0.12  # of a glyph's size between ends of strokes that count as the same
