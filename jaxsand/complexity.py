@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxsand.goals import letters as goals
-from jaxsand.planner import Cell, Plan, plan
-from jaxsand.planner.paper import ALPHA
+from jaxsand.planning.binary import Cell, Plan, plan
+from jaxsand.planning.binary.paper import ALPHA
 
 Tell = Callable[[str], None]
 PUBLISHED = {

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from jaxsand.goals.letters import letter_map
-from jaxsand.planner.frontier import Bound, layered, misdug, two_colours
-from jaxsand.planner.graph import Graph, goal_only, with_margin
+from jaxsand.planning.binary.frontier import Bound, layered, misdug, two_colours
+from jaxsand.planning.binary.graph import Graph, goal_only, with_margin
 
 
 def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[dict[str, Any]]:

@@ -22,11 +22,11 @@ from jaxsand.gradcheck import (
     sloped,
 )
 from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
 from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
 from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window
-from jaxsand.strokeloss import GRADIENT, SandLoss
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from jaxsand.goals import letters as goals
-from jaxsand.shaping import Layout, glyph_target, map_target, shape
+from jaxsand.planning.pipeline import Layout, glyph_target, map_target, shape
 
 Tell = Callable[[str], None]
 

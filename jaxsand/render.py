@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxsand.planner import Plan
-from jaxsand.shaping import ShapeResult
+from jaxsand.planning.binary import Plan
+from jaxsand.planning.pipeline import ShapeResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,10 +9,10 @@ import jax
 import numpy as np
 
 from jaxsand.interaction.simulate import step
-from jaxsand.sandplan import plan_sand, rivals
-from jaxsand.sandplan.actions import Job, Lattice, Steps, propose
-from jaxsand.sandplan.rollouts import distance, pushed, replay, roughly_pushed
-from jaxsand.sandplan.tasks import SAND_TASKS, SandTask, sand_task
+from jaxsand.planning.search import plan_sand, rivals
+from jaxsand.planning.search.actions import Job, Lattice, Steps, propose
+from jaxsand.planning.search.rollouts import distance, pushed, replay, roughly_pushed
+from jaxsand.planning.search.tasks import SAND_TASKS, SandTask, sand_task
 
 Tell = Callable[[str], None]
 

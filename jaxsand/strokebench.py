@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.optimise import first, print_of, search
-from jaxsand.optimise.account import Account
-from jaxsand.optimise.moves import reordered
+from jaxsand.planning.gradient import first, print_of, search
+from jaxsand.planning.gradient.account import Account
+from jaxsand.planning.gradient.moves import reordered
+from jaxsand.planning.stroke_loss import Best, SandLoss
 from jaxsand.strokegoals import GOALS, StrokeGoal
-from jaxsand.strokeloss import Best, SandLoss
 from jaxsand.strokerivals import RIVALS, Found
 
 Tell = Callable[[str], None]

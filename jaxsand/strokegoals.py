@@ -9,12 +9,12 @@ import numpy as np
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
 from jaxsand.interaction.simulate import check, rollout
+from jaxsand.planning.pipeline import terrain_surface
+from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.shaping import terrain_surface
-from jaxsand.strokeloss import SandLoss
 
 CELLS, SPACING = 32, 0.01
 """Cells along a side of the map that glyphs are judged on, and their size (m)."""

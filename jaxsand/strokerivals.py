@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.strokeloss import Best, Evaluate
+from jaxsand.planning.stroke_loss import Best, Evaluate
 
 
 @dataclass(frozen=True)

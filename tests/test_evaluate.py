@@ -7,7 +7,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from jaxsand.stages import Stages
+from jaxsand.planning.learned.stages import Stages
 from jaxsand.strokegoals import letters
 from train.curves import curve, curves_figure, main
 from train.evaluate import evaluate, judged, picture

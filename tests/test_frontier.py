@@ -10,9 +10,9 @@ import pytest
 import jaxsand as js
 from jaxsand.expansions import heap_misdug, heap_two_colours
 from jaxsand.goals.letters import letter_map
-from jaxsand.planner import connected_pieces, frontier
-from jaxsand.planner.frontier import layered, misdug, two_colours
-from jaxsand.planner.graph import goal_only, grid_near, make_graph, with_margin
+from jaxsand.planning.binary import connected_pieces, frontier
+from jaxsand.planning.binary.frontier import layered, misdug, two_colours
+from jaxsand.planning.binary.graph import goal_only, grid_near, make_graph, with_margin
 
 SMALL = {"chunk": 512, "slots": 1 << 14}  # one set of programs for all small maps
 

@@ -11,14 +11,14 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 import jaxsand as js
 from jaxsand import complexity
 from jaxsand.goals.letters import letter_map
-from jaxsand.planner import connected_pieces, make_problem, relaxed
-from jaxsand.planner.anytime import nearest_first, simple_bound
-from jaxsand.planner.board import MOVES, blocks_of
-from jaxsand.planner.bound import block_bound
-from jaxsand.planner.exact import exact
-from jaxsand.planner.improve import improved
-from jaxsand.planner.plans import walk_cost
-from jaxsand.planner.sweepline import Ends, Sweep, steps_of
+from jaxsand.planning.binary import connected_pieces, make_problem, relaxed
+from jaxsand.planning.binary.anytime import nearest_first, simple_bound
+from jaxsand.planning.binary.board import MOVES, blocks_of
+from jaxsand.planning.binary.bound import block_bound
+from jaxsand.planning.binary.exact import exact
+from jaxsand.planning.binary.improve import improved
+from jaxsand.planning.binary.plans import walk_cost
+from jaxsand.planning.binary.sweepline import Ends, Sweep, steps_of
 
 ENGINES = ("astar", "exact", "anytime")
 

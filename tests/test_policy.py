@@ -8,10 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsand.policy import Policy, load_policy, save_policy
-from jaxsand.scene.scene import make_scene
-from jaxsand.scene.tools import Blade
-from jaxsand.strokenet import (
+from jaxsand.planning.learned._square_symmetries import turned, turned_back, turned_strokes, turned_strokes_back
+from jaxsand.planning.learned.network import (
     Lines,
     Scores,
     StrokeNet,
@@ -21,7 +19,9 @@ from jaxsand.strokenet import (
     spread,
     symmetric,
 )
-from jaxsand.turns import turned, turned_back, turned_strokes, turned_strokes_back
+from jaxsand.planning.learned.policy import Policy, load_policy, save_policy
+from jaxsand.scene.scene import make_scene
+from jaxsand.scene.tools import Blade
 
 NET = StrokeNet((8, 8, 8), (1, 1, 1))
 SIDE = 32

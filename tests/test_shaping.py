@@ -5,10 +5,10 @@ import string
 import numpy as np
 import pytest
 
-from jaxsand import shaping
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
 from jaxsand.goals.metrics import volume_error
+from jaxsand.planning import pipeline as shaping
 
 
 def shape(target, before=None):

@@ -10,12 +10,12 @@ import jaxsand as js
 from jaxsand import strokebench
 from jaxsand.__main__ import main
 from jaxsand.interaction.simulate import rollout
+from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.window import Window
 from jaxsand.strokebench import reached, run_all
 from jaxsand.strokefigures import strokes_figure
 from jaxsand.strokegoals import letters_on_rough_sand, many_strokes, stroke_goal, turned_letters
-from jaxsand.strokeloss import SandLoss
 from jaxsand.strokerivals import RIVALS, random_shooting
 
 BOUNDS = np.array([[0.0, 0.0, 0.0, 0.0], [0.3, 0.2, 0.3, 0.2]])

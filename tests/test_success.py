@@ -3,9 +3,9 @@
 import numpy as np
 
 from jaxsand.goals.layout import right, strict, strokes_right
+from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import letters
-from jaxsand.strokeloss import SandLoss
 
 DEPTH = float(Blade().depth)
 E = letters("E")[0]  # four strokes

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsand.policy import Policy, about_policy
+from jaxsand.planning.learned.policy import Policy, about_policy
 from train import commands
 from train.__main__ import main
 from train.ddpg import Ddpg

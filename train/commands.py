@@ -59,7 +59,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
     tell("getting ready")
     out = folder(options.out) if options.out else None
     if options.run == "pretrained":
-        from jaxsand.policy import load_policy
+        from jaxsand.planning.learned.policy import load_policy
 
         report = _on_sand(load_policy(), options, tell, out)
     else:
@@ -77,7 +77,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
 
 def run_shipping(options: argparse.Namespace) -> None:
     """Writes a run's best policy where jaxsand looks for it, with how it was made."""
-    from jaxsand.policy import save_policy
+    from jaxsand.planning.learned.policy import save_policy
     from train.hindsight import Hindsight
     from train.runs import about_run, learner_of, load, seed_of
 
@@ -126,7 +126,7 @@ def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
 
 
 def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None) -> dict[str, Any]:
-    from jaxsand.stages import Stages
+    from jaxsand.planning.learned.stages import Stages
     from train.evaluate import evaluate, picture
     from train.glyphs import SETS, read_glyphs
 

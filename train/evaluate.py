@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxsand.goals import metrics as task
 from jaxsand.goals.layout import right, strict, strokes_right
-from jaxsand.lookahead import Proposes
-from jaxsand.stages import Stages, plan_by_policy
+from jaxsand.planning.learned.beam_search import Proposes
+from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.strokefigures import found_figure
 from jaxsand.strokegoals import StrokeGoal
 

@@ -19,7 +19,7 @@ from jax import lax
 from jaxsand.env.maps import STEPS, MapPool, map_pool
 from jaxsand.env.onmap import MapParams, OnMap
 from jaxsand.goals import letters as goals
-from jaxsand.planner import Cell, plan
+from jaxsand.planning.binary import Cell, plan
 from train.qnet import Greedy, best, of
 
 MOST = 3

@@ -22,11 +22,11 @@ import optax
 
 from jaxsand.goals.layout import right, strokes_right
 from jaxsand.goals.metrics import iou
-from jaxsand.lookahead import one_after_the_other
-from jaxsand.policy import Policy, in_batches
+from jaxsand.planning.learned.beam_search import one_after_the_other
+from jaxsand.planning.learned.network import StrokeNet, ends, judge, likeliest, spread
+from jaxsand.planning.learned.policy import Policy, in_batches
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.strokegoals import CELLS, SPACING, usual_scene
-from jaxsand.strokenet import StrokeNet, ends, judge, likeliest, spread
 from train.lessons import Lessons, lessons, way
 from train.plans import MOST, random_plans
 from train.sand import other_scene, starts

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxsand.planning.stroke_loss import pushed
 from jaxsand.scene.scene import Scene
-from jaxsand.strokeloss import pushed
 from train.plans import MOST, anywhere, random_plans
 
 Choose = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -19,14 +19,14 @@ from matplotlib.path import Path as Outline
 
 from jaxsand.commands.arguments import Parser, count, ended, seed
 from jaxsand.files import as_json, as_table, progress
-from jaxsand.optimise import optimise_strokes
-from jaxsand.policy import load_policy
+from jaxsand.planning.gradient import optimise_strokes
+from jaxsand.planning.learned.policy import load_policy
+from jaxsand.planning.learned.stages import Stages, plan_by_policy
+from jaxsand.planning.search import plan_sand
+from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.sandplan import plan_sand
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.stages import Stages, plan_by_policy
-from jaxsand.strokeloss import SandLoss
 
 _SHAPE, _SPACING, _ANGLE = (30, 60), 0.01, math.radians(30)
 _CHANGED = 0.1  # of the goal's depth

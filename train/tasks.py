@@ -12,10 +12,10 @@ from jaxsand.env.library import RandomStrokes
 from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.goals import metrics as task
 from jaxsand.goals.layout import right
-from jaxsand.lookahead import one_after_the_other
+from jaxsand.planning.learned.beam_search import one_after_the_other
+from jaxsand.planning.stroke_loss import pushed
 from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import usual_scene
-from jaxsand.strokeloss import pushed
 from train.actor import Acts
 from train.probes import Probe
 

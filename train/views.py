@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.env.maps import STEPS
-from jaxsand.turns import turned_back as turned
+from jaxsand.planning.learned._square_symmetries import turned_back as turned
 from train.qnet import Greedy
 
 VIEWS = range(8)

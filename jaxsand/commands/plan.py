@@ -11,7 +11,7 @@ from jaxsand.files import folder, progress, read_text, write_json, written
 def run_plan(options: argparse.Namespace) -> None:
     tell = progress()
     from jaxsand.goals import letters as goals
-    from jaxsand.planner import plan
+    from jaxsand.planning.binary import plan
 
     own: tuple[int, int] | None
     if len(options.map) == 1:

@@ -12,10 +12,10 @@ from jaxsand.files import existing, folder, progress, read_text, write_json, wri
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxsand.optimise import Optimised
-    from jaxsand.sandplan import SandPlan
-    from jaxsand.shaping import Layout, ShapeResult, Target
-    from jaxsand.stages import Planned
+    from jaxsand.planning.gradient import Optimised
+    from jaxsand.planning.learned.stages import Planned
+    from jaxsand.planning.pipeline import Layout, ShapeResult, Target
+    from jaxsand.planning.search import SandPlan
 
 
 def run_shape(options: argparse.Namespace) -> None:
@@ -23,9 +23,9 @@ def run_shape(options: argparse.Namespace) -> None:
     tell = progress()
     started = time.perf_counter()
     tell("reading the goal")
-    from jaxsand.methods import by_policy, optimised, searched
+    from jaxsand.planning.methods import by_policy, optimised, searched
+    from jaxsand.planning.pipeline import shape
     from jaxsand.render import save_animation, save_figure, shape_figure
-    from jaxsand.shaping import shape
 
     began = time.perf_counter()
     looks = options.method in ("search", "optimise", "policy")
@@ -42,7 +42,7 @@ def run_shape(options: argparse.Namespace) -> None:
     if options.method == "optimise":
         target = optimised(target, surface, options.strokes, options.pushes or 4000, options.seed or 0, tell)
     if options.method == "policy":
-        from jaxsand.stages import Stages
+        from jaxsand.planning.learned.stages import Stages
 
         polish = (options.pushes or 4000) if options.refine else 0
         target = by_policy(target, surface, strokes, Stages(options.lookahead or 0, polish), tell)
@@ -108,8 +108,8 @@ def _check_options(options: argparse.Namespace) -> None:
 
 def _found(found: "SandPlan | Optimised | Planned") -> dict[str, Any]:
     """l2 distances in m; `rollouts` counts rough pushes and gradients by what they cost."""
-    from jaxsand.optimise import Optimised
-    from jaxsand.stages import Planned
+    from jaxsand.planning.gradient import Optimised
+    from jaxsand.planning.learned.stages import Planned
 
     if isinstance(found, Planned):
         return {"before": found.before**0.5, "after": found.after**0.5, "rollouts": found.calls}
@@ -149,8 +149,8 @@ def _summary(report: dict[str, Any]) -> str:
 
 
 def _target(options: argparse.Namespace) -> "Target":
-    from jaxsand import shaping
     from jaxsand.goals import letters as goals
+    from jaxsand.planning import pipeline as shaping
 
     name, method = options.goal, options.method
     path = Path(name)
@@ -190,7 +190,7 @@ def _target(options: argparse.Namespace) -> "Target":
 
 
 def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
-    from jaxsand.shaping import Layout
+    from jaxsand.planning.pipeline import Layout
 
     depth = depth_mm if options.depth_mm is None else options.depth_mm
     spacing = 0.01 if options.spacing is None else options.spacing
@@ -211,8 +211,8 @@ def _cells(options: argparse.Namespace) -> int:
 
 
 def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | None":
-    from jaxsand import shaping
     from jaxsand.goals import letters as goals
+    from jaxsand.planning import pipeline as shaping
 
     if options.surface == "level":
         return None

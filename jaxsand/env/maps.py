@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.planner import Cell, make_problem, plan
-from jaxsand.planner.board import MOVES
+from jaxsand.planning.binary import Cell, make_problem, plan
+from jaxsand.planning.binary.board import MOVES
 
 STEPS = np.array([*MOVES.values()], np.int32)
 """Rows and columns that N, E, S and W go on, in that order."""

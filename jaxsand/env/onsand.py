@@ -14,9 +14,9 @@ from jaxsand.env.spaces import Box, Dict, Discrete
 from jaxsand.goals import metrics as task
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import act
+from jaxsand.planning.pipeline import Layout
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Pose, coverage
-from jaxsand.shaping import Layout
 
 
 @jax.tree_util.register_dataclass

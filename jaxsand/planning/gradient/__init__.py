@@ -1,0 +1,194 @@
+"""Strokes that turn a start map into a goal map, by gradients through the simulator.
+
+First guesses cost one call (sketch.py): the print of one stroke, matched to the goal. Then rounds of moves (moves.py) on
+several plans at once: other orders and directions, Adam on blurred and then on sharp maps, strokes put where sand is still
+due, L-BFGS, until the goal is reached or the budget is spent.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.planning.gradient import moves
+from jaxsand.planning.gradient.account import Account
+from jaxsand.planning.gradient.sketch import Print, guesses
+from jaxsand.planning.stroke_loss import Best, SandLoss, pushed
+from jaxsand.relaxation.stopping import check_whole
+from jaxsand.scene.scene import Scene, as_array, blade_of
+
+_LANES = 4  # plans that go downhill together
+_STEPS = 6  # of Adam on blurred maps
+_REACHED = 1e-4  # of the start's loss: near enough to stop
+_NEARLY = 1.15  # times the least that prints leave of the squared change
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """What `optimise_strokes` found: the plan `strokes` [N, 4] (m) and the `height` [H, W] (m) that it leaves; the `losses`
+    (m^2) of the start and of every better plan on the way, the `calls` after which each was found, and those `spent` in all
+    (pushes simulated, a gradient counted at what it costs)."""
+
+    strokes: np.ndarray
+    losses: np.ndarray
+    calls: np.ndarray
+    spent: int
+    height: np.ndarray
+
+
+@dataclass(frozen=True)
+class Blurred:
+    """Smoothing: before anything goes downhill on sharp maps, Adam sees them and the goal blurred by Gaussians of these
+    standard deviations, in `cells`, one after the other. A stroke beside its trench then feels it from farther away."""
+
+    cells: tuple[float, ...] = (1.0,)
+
+    def __post_init__(self) -> None:
+        if not all(0 < c < math.inf for c in self.cells):
+            raise ValueError(f"smoothing.cells: got {self.cells!r}; give positive numbers, or smoothing=None")
+
+
+def optimise_strokes(
+    scene: Scene,
+    goal: jax.typing.ArrayLike,
+    *,
+    strokes: int | None = None,
+    key: jax.Array | int = 0,
+    start: jax.typing.ArrayLike | None = None,
+    budget: int = 4_000,
+    most: int = 8,
+    smoothing: Blurred | None = Blurred(),
+    guess: jax.typing.ArrayLike | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Optimised:
+    """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
+
+    Minimises sum (h - goal)^2 over plans of `strokes` pushes, or of as many as pay, up to `most`, if None. Stops at a
+    ten-thousandth of the start's loss, or after `budget` simulator calls. Where nothing is to change, or nothing was found
+    that brings the sand closer than it was, there are no strokes. The same key finds the same plan on the same machine. Not
+    differentiable itself. The first call for a shape of map compiles, for about half a minute on two cores.
+
+    Given a `guess` [N, 4] (m), such as a policy's plan, it starts from that instead of from a sketch.
+
+    Raises:
+      ValueError: for a scene without a blade, a start or goal of another shape, or a key or count out of range.
+    """
+    blade_of(scene)
+    check_whole("budget", budget, 1)
+    check_whole("most", most, 1, 64)
+    if strokes is not None:
+        check_whole("strokes", strokes, 1, 64)
+    level = np.zeros(scene.grid.shape, np.float32)
+    sand = SandLoss(
+        scene,
+        level if start is None else np.asarray(as_array("start", start), np.float32),
+        np.asarray(as_array("goal", goal), np.float32),
+    )
+    rng = np.random.default_rng(_entropy(key))
+    account = Account(sand, budget, tell)
+    plan = None if guess is None else _plan(guess, strokes)
+    if account.before > 0 and plan is None:
+        search(account, strokes, rng, most, smoothing)
+    elif account.before > 0 and plan is not None and len(plan):
+        improve(account, print_of(account), (plan[None], account.losses(plan[None])), rng, smoothing)
+    steps = [Best(0, account.before, np.zeros((0, 4))), *(best for best in account.history if best.loss < account.before)]
+    found = steps[-1].strokes
+    height = sand.maps(found[None])[0]
+    return Optimised(found, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), account.calls, height)
+
+
+def search(
+    account: Account,
+    strokes: int | None,
+    rng: np.random.Generator,
+    most: int = 8,
+    smoothing: Blurred | None = Blurred(),
+) -> None:
+    """Spends the account's budget on plans of so many strokes, or of as many as pay."""
+    mark = print_of(account)
+    count = strokes or as_many_as_pay(account, mark, most, rng)
+    plans = first(account, mark, count, rng)
+    if plans is not None and np.ptp(account.sand.start) > 0:  # prints say little of rough sand
+        felt = moves.stroke_by_stroke(account, count, account.room(count) * count // 2, rng)
+        plans = moves.ranked(np.concatenate([felt[0], plans[0]]), np.concatenate([felt[1], plans[1]]), 1)
+    if plans is not None:
+        improve(account, mark, plans, rng, smoothing)
+
+
+def as_many_as_pay(account: Account, mark: Print, most: int, rng: np.random.Generator) -> int:
+    """The fewest strokes whose prints come nearly as close as those of any number up to `most`; without any calls."""
+    sand, far = account.sand, list[float]()
+    for n in range(1, most + 1):
+        far.append(guesses(mark, sand.start, sand.goal, n, rng)[1][0])
+        if n > 2 and min(far[-2:]) > min(far):  # the prints of more only get in each other's way
+            break
+    return 1 + next(n for n, left in enumerate(far) if left <= _NEARLY * min(far))
+
+
+def print_of(account: Account) -> Print:
+    """What one stroke of half the map's shorter side leaves of level sand."""
+    scene = account.sand.scene
+    rows, columns = scene.grid.shape
+    dx = float(scene.grid.spacing)
+    length = max(min(rows, columns) / 2, 1.0)
+    x, y = round((columns - length) / 2), round(rows / 2) + 0.5
+    stroke = np.array([[x, y, x + length, y]]) * dx
+    account.calls += 1
+    height = pushed(scene, np.zeros((1, rows, columns)), stroke)[0]
+    return Print(jnp.asarray(np.nan_to_num(height)), jnp.array([x - 0.5, y - 0.5], jnp.float32), jnp.float32(length))
+
+
+def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator) -> moves.Plans | None:
+    """Plans from the sketch, closest first; None if the budget is spent."""
+    dx = float(account.sand.scene.grid.spacing)
+    plans = guesses(mark, account.sand.start, account.sand.goal, strokes, rng)[0] * dx
+    plans = np.clip(plans, *account.sand.bounds)
+    plans = plans[: max(1, min(len(plans), account.room(strokes) // 4))]
+    losses = account.losses(plans)
+    return moves.ranked(plans, losses, _LANES) if np.isfinite(losses).any() else None
+
+
+def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Generator, smoothing: Blurred | None) -> None:
+    """Rounds of moves until the goal is reached or the budget is spent; none if no plan could be pushed yet."""
+    if not account.history:
+        return
+    dx = float(account.sand.scene.grid.spacing)
+    plans = moves.reordered(account, plans)
+    for blur in smoothing.cells if smoothing else ():
+        plans = moves.adam(account, plans, _STEPS, 0.15 * dx, blur)
+    while account.best.loss > _REACHED * account.before and account.room(plans[0].shape[1]) > 0:
+        last, spent = plans[1][0], account.calls
+        plans = moves.reordered(account, plans)
+        plans = moves.adam(account, plans, 8, 0.1 * dx)
+        plans = moves.replaced(account, mark, plans, rng)
+        front = moves.quasi_newton(account, (plans[0][:1], plans[1][:1]), 4)
+        plans = _joined(front, (plans[0][1:], plans[1][1:]))
+        if plans[1][0] > 0.98 * last:  # stuck: from beside the best plan
+            near = plans[0][:1] + rng.normal(0, 0.7 * dx, (_LANES - 1, *plans[0].shape[1:]))
+            near = np.clip(near, *account.sand.bounds)
+            plans = _joined((plans[0][:1], plans[1][:1]), (near, account.losses(near)))
+        if account.calls == spent:
+            break
+
+
+def _joined(a: moves.Plans, b: moves.Plans) -> moves.Plans:
+    return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
+
+
+def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:
+    plan = np.asarray(as_array("guess", guess), float)
+    if plan.ndim != 2 or plan.shape[1] != 4 or strokes not in (None, len(plan)) or not np.isfinite(plan).all():
+        raise ValueError(f"guess: got shape {list(plan.shape)}; give [{strokes or 'N'}, 4], finite x0, y0, x1, y1 in metres")
+    return plan
+
+
+def _entropy(key: jax.Array | int) -> np.ndarray:
+    if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jax.random.key_data(key)
+    numbers = np.atleast_1d(np.asarray(key)).ravel()
+    if numbers.dtype.kind not in "iu" or not len(numbers) or numbers.min() < 0:
+        raise ValueError(f"key: got {key!r}; give jax.random.key(0), or a whole number from 0 on")
+    return numbers

@@ -1,0 +1,80 @@
+"""What the optimiser has spent and found: every stroke pushed on a map is a call, every gradient as many as it costs."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from jaxsand.planning.stroke_loss import GRADIENT, Best, SandLoss
+
+
+@dataclass
+class Account:
+    """Counts calls up to a budget and keeps the best plan; every member function spends."""
+
+    sand: SandLoss
+    budget: int
+    tell: Callable[[str], None] = lambda _: None
+    calls: int = 0
+    history: list[Best] = field(default_factory=list)
+
+    @property
+    def before(self) -> float:
+        """The loss of the start (m^2)."""
+        return self.sand.loss_of(self.sand.start)
+
+    @property
+    def best(self) -> Best:
+        return self.history[-1]
+
+    def room(self, strokes: int) -> int:
+        """For how many plans of so many strokes there are calls left."""
+        return (self.budget - self.calls) // max(strokes, 1)
+
+    def losses(self, plans: np.ndarray) -> np.ndarray:
+        """The losses of plans [P, N, 4]; infinite for those that the budget has no room for."""
+        some = plans[: self.room(plans.shape[1])]
+        out = np.full(len(plans), np.inf)
+        if len(some):
+            self.calls += len(some) * plans.shape[1]
+            out[: len(some)] = self.sand(some)
+            self._note(some, out[: len(some)])
+        return out
+
+    def gradient(self, plans: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
+        """The losses of plans, and the gradients of the losses of maps blurred by so many cells."""
+        self.calls += len(plans) * plans.shape[1] * (1 + GRADIENT)
+        sharp: list[np.ndarray] = []
+
+        def weigh(off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            sharp.append((off**2).sum((1, 2)))
+            soft = gaussian_filter(off, (0, blur, blur)) if blur else off
+            return sharp[0], 2 * (gaussian_filter(soft, (0, blur, blur)) if blur else soft)
+
+        losses, gradients = self.sand.gradient(plans, weigh)
+        self._note(plans, losses)
+        return losses, gradients
+
+    def afford(self, plans: np.ndarray) -> bool:
+        """Whether the budget has room for a gradient of all the plans."""
+        return self.room(plans.shape[1]) >= len(plans) * (1 + GRADIENT)
+
+    def maps(self, plans: np.ndarray) -> np.ndarray:
+        """The maps that plans [P, N, 4] leave."""
+        self.calls += len(plans) * plans.shape[1]
+        return self.sand.maps(plans)
+
+    def after(self, height: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The losses and the maps after one more stroke of [P, 4] (m) each on a map [H, W]."""
+        self.calls += len(strokes)
+        return self.sand.after(np.repeat(height[None], len(strokes), axis=0), strokes)
+
+    def _note(self, plans: np.ndarray, losses: np.ndarray) -> None:
+        first = int(np.argmin(losses))
+        if np.isfinite(losses[first]) and (not self.history or losses[first] < self.best.loss):
+            self.history.append(Best(self.calls, float(losses[first]), plans[first].copy()))
+            left = np.sqrt(losses[first] / self.before) if self.before else 0.0
+            self.tell(
+                f"{self.calls:,} of {self.budget:,} calls: {len(plans[first])} strokes, {left:.1%} of the distance left"
+            )

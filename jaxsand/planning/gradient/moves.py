@@ -1,0 +1,155 @@
+"""How plans are made better: downhill by gradients, by other orders and directions, by strokes put where sand is still due.
+
+A move takes plans [P, N, 4] (m) with their losses, closest first, and gives back plans that are no worse.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+
+from jaxsand.planning.gradient.account import Account
+from jaxsand.planning.gradient.sketch import Print, guesses, swaps
+
+Plans = tuple[np.ndarray, np.ndarray]  # [P, N, 4] (m), closest first, and their losses [P] (m^2)
+_STEPS = (1.0, 0.3, 0.1, 0.03)  # lengths that a quasi-Newton step is tried at
+_MEMORY = 8  # gradients that the quasi-Newton steps remember
+_DRAWN = 32  # strokes that are tried at a time
+_TRIED = 3  # strokes that are tried in the place of one
+
+
+def ranked(plans: np.ndarray, losses: np.ndarray, most: int) -> Plans:
+    """The best `most` plans that differ."""
+    kept: list[int] = []
+    for i in np.argsort(losses, kind="stable"):
+        if all(np.abs(plans[i] - plans[k]).max() > 1e-4 for k in kept):
+            kept.append(int(i))
+        if len(kept) == most:
+            break
+    return plans[kept], losses[kept]
+
+
+def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 0.0) -> Plans:
+    """Downhill by Adam, whose first step is `size` (m) and whose last a tenth of it."""
+    plans, losses = start[0].copy(), start[1].copy()
+    rule = optax.adam(optax.cosine_decay_schedule(size, max(steps, 1), 0.1), b2=0.95)
+    here: Any = plans.copy()
+    state = rule.init(here)
+    for _ in range(steps):
+        if not account.afford(here):
+            break
+        now, slope = account.gradient(here, blur)
+        better = now < losses
+        plans[better], losses[better] = here[better], now[better]
+        update, state = rule.update(np.nan_to_num(slope) / account.before, state)
+        here = _inside(account, here + np.asarray(update))
+    return ranked(plans, losses, len(plans))
+
+
+def quasi_newton(account: Account, start: Plans, steps: int) -> Plans:
+    """Downhill by L-BFGS, every plan for itself; of four lengths of a step the best is taken."""
+    plans, losses = start[0].copy(), start[1].copy()
+    rule = optax.scale_by_lbfgs(_MEMORY)
+    scale = 1e-3  # metres to about the size that gradients change over
+    state = jax.vmap(rule.init)(plans / scale)
+    for _ in range(steps):
+        if not account.afford(plans):
+            break
+        _, slope = account.gradient(plans, 0.0)
+        slope = np.nan_to_num(slope) * scale / account.before
+        way, state = jax.vmap(rule.update)(slope, state, plans / scale)
+        way = -np.asarray(way) * scale
+        longest = np.abs(way).max((1, 2), keepdims=True)
+        way *= np.minimum(1, 5e-3 / np.maximum(longest, 1e-12))
+        tried = _inside(account, plans[:, None] + way[:, None] * np.array(_STEPS)[None, :, None, None])
+        far = account.losses(tried.reshape(-1, *plans.shape[1:])).reshape(len(plans), -1)
+        which = np.argmin(far, axis=1)
+        lane = np.arange(len(plans))
+        better = far[lane, which] < losses
+        plans[better], losses[better] = tried[lane, which][better], far[lane, which][better]
+        if not better.any():
+            break
+    return ranked(plans, losses, len(plans))
+
+
+def reordered(account: Account, start: Plans) -> Plans:
+    """The best plan with two strokes swapped or one turned round, as long as that helps."""
+    plans, losses = start
+    while True:
+        plan, n = plans[0], plans.shape[1]
+        others = list(plan[swaps(n)])
+        for k in range(n):
+            turned = plan.copy()
+            turned[k] = plan[k, [2, 3, 0, 1]]
+            others.append(turned)
+        far = account.losses(np.stack(others))
+        better = float(far.min()) < losses[0] * 0.999
+        plans, losses = ranked(np.concatenate([plans, others]), np.concatenate([losses, far]), len(plans))
+        if not better:
+            return plans, losses
+
+
+def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generator) -> Plans:
+    """The best plan with one of its strokes put where the others leave most undone, first or last or in its place."""
+    plans, losses = start
+    plan, n = plans[0], plans.shape[1]
+    dx = float(account.sand.scene.grid.spacing)
+    others = []
+    for k in range(n):
+        rest = np.delete(plan, k, axis=0)
+        if account.room(n) < 1 + 3 * _TRIED:
+            break
+        left = account.maps(rest[None])[0] if n > 1 else account.sand.start
+        if np.isnan(left).any():
+            continue
+        new = _inside(account, guesses(mark, left, account.sand.goal, 1, rng)[0][:_TRIED, 0] * dx)
+        others += [np.insert(rest, place, stroke, axis=0) for stroke in new for place in {0, k, n - 1}]
+    if not others:
+        return start
+    far = account.losses(np.stack(others))
+    return ranked(np.concatenate([plans, others]), np.concatenate([losses, far]), len(plans))
+
+
+def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.Generator) -> Plans:
+    """A plan found on the sand itself, in about so many calls: each stroke is the best of those tried on what earlier ones
+    left. They run from where sand is too high to where it is too low, or anywhere, and then from near the best."""
+    sand, low, high = account.sand, *account.sand.bounds
+    dx = float(sand.scene.grid.spacing)
+    here, plan = sand.start, np.zeros((0, 4))
+    for _ in range(strokes):
+        best, least = np.concatenate([low[:2], low[:2]]), np.inf
+        rounds = max(1, calls // strokes // _DRAWN)
+        for k in range(rounds):
+            if k < max(1, rounds // 3):
+                drawn = _from_high_to_low(here.astype(float) - sand.goal, rng) * dx
+                anywhere = rng.random((_DRAWN, 4)) * (high - low) + low
+                drawn = np.where(rng.random((_DRAWN, 1)) < 0.5, drawn, anywhere)
+            else:
+                drawn = best + rng.normal(0, 1, (_DRAWN, 4)) * np.geomspace(0.3, 6, _DRAWN)[:, None] * dx
+            drawn = _inside(account, drawn)[: account.room(1)]
+            if not len(drawn):
+                break
+            far, maps = account.after(here, drawn)
+            first = int(np.argmin(far))
+            if far[first] < least:
+                best, least, there = drawn[first], float(far[first]), maps[first]
+        if not np.isfinite(least):
+            break
+        here, plan = there, np.concatenate([plan, best[None]])
+    return plan[None], account.losses(plan[None])
+
+
+def _from_high_to_low(off: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Strokes [n, 4] (cells) from where sand is too high to where it is too low, the likelier the more."""
+    ends = []
+    for much in (np.maximum(off, 0), np.maximum(-off, 0)):
+        share = (much + 1e-12).ravel()
+        rows, columns = np.unravel_index(rng.choice(share.size, _DRAWN, p=share / share.sum()), off.shape)
+        ends += [columns, rows]
+    return np.stack(ends, 1) + 0.5
+
+
+def _inside(account: Account, plans: np.ndarray) -> np.ndarray:
+    low, high = account.sand.bounds
+    return np.clip(plans, low, high)

@@ -1,0 +1,1 @@
+"""Strokes proposed by a network, and looking ahead with them."""

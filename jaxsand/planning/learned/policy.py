@@ -1,0 +1,160 @@
+"""A policy that is shown a goal and the sand, and says where to push next."""
+
+import json
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+
+from jaxsand.planning.learned.network import StrokeNet, judge, likeliest, symmetric
+from jaxsand.scene.scene import Scene, blade_of
+
+SIDE = 32
+"""Cells along a side of what the network looks at; it learned on such maps."""
+
+_STRIDE = 16  # between the looks at a larger map
+_SIZES = (1, 8, 64)  # of batches, so that a few programs serve all
+_FILE = "policy.npz"
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A network and its parameters. Made by `python -m train hindsight`; `load_policy()` gives the one that jaxsand ships.
+
+    It learned on maps of 32 x 32 cells with blades about two cells wide; larger maps are looked at part by part, smaller
+    ones are padded with level sand.
+    """
+
+    net: StrokeNet
+    params: Any
+
+    def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """The `count` likeliest next strokes [B, count, 4] (m), likeliest first, for goals and current maps [B, H, W] (m),
+        and the logarithms of their likelihoods [B, count].
+
+        Raises:
+          ValueError: for a scene without a blade, or one that does not dig.
+        """
+        depth, dx = _depth(scene), float(scene.grid.spacing)
+        goal, current = (np.asarray(x, np.float32) / depth for x in (goal, current))
+        undone = ((goal - current) ** 2).sum((1, 2))
+        found, scores = [], []
+        for row, column in _looks(scene.grid.shape):
+            a, b = (_part(x, row, column) for x in (goal, current))
+            strokes, score = in_batches(partial(_read, self.net, self.params, count), a, b, _SIZES)
+            share = ((a - b) ** 2).sum((1, 2)) / np.maximum(undone, 1e-30)
+            found.append(strokes + np.array([column, row, column, row], np.float32))
+            scores.append(score + np.log(np.maximum(share, 1e-30))[:, None])
+        strokes, score = np.concatenate(found, 1), np.concatenate(scores, 1)
+        order = np.argsort(-score, axis=1, kind="stable")[:, :count]
+        most = np.array([*scene.grid.shape[::-1]] * 2, np.float32) - 0.5
+        strokes = np.clip(np.take_along_axis(strokes, order[..., None], 1), 0.5, np.maximum(most, 0.5))
+        return strokes * dx, np.take_along_axis(score, order, 1)
+
+
+def in_batches(
+    read: Callable[[np.ndarray, np.ndarray], tuple[jax.Array, ...]],
+    goal: np.ndarray,
+    current: np.ndarray,
+    sizes: Sequence[int],
+) -> tuple[np.ndarray, ...]:
+    """What `read` makes of maps [B, ...], in batches of a few `sizes`, filled up with level sand: few programs serve any
+    number."""
+    out, first = [], 0
+    while first < len(goal):
+        left = len(goal) - first
+        size = next((n for n in sizes if n >= left), sizes[-1])
+        some = slice(first, first + size)
+        pad = [(0, max(0, size - left)), (0, 0), (0, 0)]
+        got = read(np.pad(goal[some], pad), np.pad(current[some], pad))
+        out.append([np.asarray(x)[:left] for x in got])
+        first += size
+    return tuple(np.concatenate(parts) for parts in zip(*out, strict=True))
+
+
+@partial(jax.jit, static_argnames=("net", "count"))
+def _read(net: StrokeNet, params: Any, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return likeliest(judge(net, params), symmetric(net, params, goal, current), count)
+
+
+def save_policy(policy: Policy, path: Path, **about: Any) -> None:
+    """Writes a policy in half precision, with what is to be known `about` it, as numbers and text."""
+    flat = traverse_util.flatten_dict(policy.params, sep="/")
+    arrays: dict[str, Any] = {name: np.asarray(x, np.float16) for name, x in flat.items()}
+    fields = {name: getattr(policy.net, name) for name in ("widths", "blocks", "features", "sights")}
+    with path.open("wb") as file:
+        np.savez_compressed(file, about=np.array(json.dumps({"net": fields, **about})), **arrays)
+
+
+def load_policy(path: Path | None = None) -> Policy:
+    """The policy in a file, or the one that comes with jaxsand.
+
+    Raises:
+      ValueError: if there is none, or it cannot be read.
+    """
+    return _shipped() if path is None else _loaded(path)
+
+
+def about_policy(path: Path | None = None) -> dict[str, Any]:
+    """What its maker noted: its command, the minutes it took, and what it reached on goals of random strokes."""
+    with resources.as_file(resources.files("jaxsand").joinpath("data", _FILE)) as own, np.load(path or own) as data:
+        known: dict[str, Any] = json.loads(str(data["about"]))
+        return known
+
+
+@cache
+def _shipped() -> Policy:
+    with resources.as_file(resources.files("jaxsand").joinpath("data", _FILE)) as path:
+        return _loaded(path)
+
+
+def _loaded(path: Path) -> Policy:
+    try:
+        with path.open("rb") as file, np.load(file) as data:
+            fields = json.loads(str(data["about"]))["net"]
+            flat = {name: jnp.asarray(data[name], jnp.float32) for name in data.files if name != "about"}
+        net = StrokeNet(tuple(fields["widths"]), tuple(fields["blocks"]), fields["features"], fields["sights"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
+        raise ValueError(
+            f"policy: cannot read {path} ({type(error).__name__}); train one: python -m train hindsight"
+        ) from None
+    if {name: x.shape for name, x in flat.items()} != _shapes(net):
+        raise ValueError(
+            f"policy: {path} holds no parameters of this version's network; train one: python -m train hindsight"
+        )
+    return Policy(net, traverse_util.unflatten_dict(flat, sep="/"))
+
+
+def _shapes(net: StrokeNet) -> dict[str, tuple[int, ...]]:
+    """Of the network's parameters."""
+    maps = jax.ShapeDtypeStruct((1, SIDE, SIDE), jnp.float32)
+    params = jax.eval_shape(net.init, jax.random.key(0), maps, maps, jax.ShapeDtypeStruct((1, 1, 4), jnp.float32))
+    return {name: x.shape for name, x in traverse_util.flatten_dict(params, sep="/").items()}
+
+
+def _depth(scene: Scene) -> float:
+    depth = float(blade_of(scene).depth)
+    if not depth > 0:
+        raise ValueError(f"scene.tool.depth: got {depth}; the policy needs a blade that digs, such as Blade(depth=0.0075)")
+    return depth
+
+
+def _looks(shape: Sequence[int]) -> list[tuple[int, int]]:
+    """First rows and columns of the parts of a map that are looked at."""
+    firsts = [np.linspace(0, max(n - SIDE, 0), math.ceil(max(n - SIDE, 0) / _STRIDE) + 1).round().astype(int) for n in shape]
+    return [(int(r), int(c)) for r in firsts[0] for c in firsts[1]]
+
+
+def _part(maps: np.ndarray, row: int, column: int) -> np.ndarray:
+    part = maps[:, row : row + SIDE, column : column + SIDE]
+    return np.pad(part, [(0, 0), *((0, SIDE - n) for n in part.shape[1:])])

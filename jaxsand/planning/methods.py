@@ -1,0 +1,44 @@
+"""Strokes for a goal by what tries them on the sand: a search, gradients, or the policy that comes with jaxsand."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from jaxsand.planning.gradient import Optimised, optimise_strokes
+from jaxsand.planning.learned.policy import load_policy
+from jaxsand.planning.learned.stages import Planned, Stages, plan_by_policy
+from jaxsand.planning.pipeline import Target, Tell, at_rest
+from jaxsand.planning.search import SandPlan, plan_sand
+from jaxsand.planning.stroke_loss import SandLoss
+
+
+def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: int, seed: int, tell: Tell) -> Target:
+    """The same goal, by at most so many strokes from a search on real sand, at a cost of about `pushes` (see `plan_sand`).
+
+    Sand counts wherever it lies, also where the goal was drawn without berms.
+    """
+    start = at_rest(target.scene, before, tell)
+    tell(f"searching {strokes} strokes in about {pushes} pushes")
+    found = plan_sand(target.scene, start, target.goal, strokes=strokes, budget=pushes, seed=seed)
+    return _by("search", target, found, found.paths)
+
+
+def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:
+    """The same goal, by so many strokes (as many as pay if None) from gradients, at a cost of about `pushes`."""
+    start = at_rest(target.scene, before, tell)
+    tell("sketching")
+    found = optimise_strokes(target.scene, target.goal, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)
+    return _by("optimise", target, found, found.strokes.reshape(-1, 2, 2))
+
+
+def by_policy(target: Target, before: np.ndarray | None, strokes: int, stages: Stages, tell: Tell) -> Target:
+    """The same goal, by at most so many strokes of the policy, and of the stages that follow it."""
+    sand = SandLoss(target.scene, at_rest(target.scene, before, tell), target.goal.astype(np.float32))
+    found = plan_by_policy(load_policy(), sand, strokes, stages, tell)
+    return _by("policy", target, found, found.strokes.reshape(-1, 2, 2))
+
+
+def _by(method: str, target: Target, found: SandPlan | Optimised | Planned, paths: Iterable[np.ndarray]) -> Target:
+    """The same goal by what was found."""
+    return replace(target, method=method, paths=tuple(paths), optimal=None, lower_bound=None, found=found)

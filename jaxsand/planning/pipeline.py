@@ -1,0 +1,278 @@
+"""The main job: from a goal to the strokes that trench it, to the sand they leave, to what that is worth."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import pairwise
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
+from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.simulate import Shaped, act, check, follow_frames
+from jaxsand.planning.binary import Cell, connected_pieces, plan
+from jaxsand.planning.gradient import Optimised
+from jaxsand.planning.learned.stages import Planned
+from jaxsand.planning.search import SandPlan
+from jaxsand.relaxation.settling import settle, steepest_slope
+from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
+
+Kind = Literal["map", "glyph", "image", "heights", "terrain"]
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a binary map is laid out in sand: `cell` grid cells to a map cell, `spacing` and `depth` in m.
+
+    A pushed trench is narrower than the blade, since its berms slide back over the edges: at half depth by about
+    sqrt(depth width / tan(repose)). So trenches are shallow against a cell, and the blade is a little larger than one.
+    """
+
+    cell: int = 6
+    spacing: float = 0.01
+    depth: float = 0.003
+    oversize: float = 1.15
+    margin: int = 10
+
+    @property
+    def blade(self) -> Blade:
+        side = self.oversize * self.cell * self.spacing
+        return Blade(side, side, self.depth)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A goal with the strokes that are to reach it.
+
+    `paths` are followed one after the other, the tool lifted in between. `drawn` goals hold no berms and are compared on
+    what is dug.
+    """
+
+    name: str
+    kind: Kind
+    method: str
+    scene: Scene
+    goal: np.ndarray
+    paths: tuple[np.ndarray, ...]
+    drawn: bool
+    depth: float
+    optimal: bool | None = None  # whether the steps are proven fewest, and what is proven of them; plans only
+    lower_bound: float | None = None
+    found: SandPlan | Optimised | Planned | None = None  # what a search on real sand says of itself
+
+    @property
+    def footprint(self) -> tuple[float, float]:
+        """The blade's extent along and across its heading (m)."""
+        tool = self.scene.tool
+        return (float(tool.thickness), float(tool.width)) if isinstance(tool, Blade) else (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ShapeResult:
+    """What came out: the map before and after, frames on the way, the figures, and seconds apart for compile and run."""
+
+    target: Target
+    before: np.ndarray
+    after: np.ndarray
+    frames: np.ndarray
+    tools: np.ndarray  # x, y, cos, sin of the tool in each frame; NaN while it is lifted
+    figures: dict[str, float]
+    seconds: dict[str, float]
+
+    @property
+    def lifted(self) -> bool:
+        return len(self.target.paths) > 1
+
+    @property
+    def steps(self) -> int:
+        """Legs of some length."""
+        return sum(int(np.any(np.diff(path, axis=0), axis=1).sum()) for path in self.target.paths)
+
+    @property
+    def strokes(self) -> list[list[float]]:
+        """Every leg as x0, y0, x1, y1 (m), in order."""
+        return [[float(v) for v in (*a, *b)] for p in self.target.paths for a, b in pairwise(p)]
+
+
+def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -> Target:
+    """A shortest single stroke over a binary map (row 0 on top), pushed with a blade of about one map cell."""
+    found = plan(dig, start)
+    rows, columns = dig.shape
+    shape = (rows * layout.cell + 2 * layout.margin, columns * layout.cell + 2 * layout.margin)
+    scene = make_scene(shape, layout.spacing, tool=layout.blade)
+    goal = task.map_goal(dig, layout.cell, layout.margin, layout.depth)
+    path = task.cell_centre(np.array(found.cells), rows, layout.cell, layout.margin, layout.spacing)
+    path = np.concatenate([path, path[-1:]]) if len(path) == 1 else path
+    return Target(name, "map", "plan", scene, goal, (path,), True, layout.depth, found.optimal, found.lower_bound)
+
+
+def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
+    """A shortest single stroke over each piece of a height map that lies deeper than half the depth.
+
+    The map is planned on blocks of `layout.cell` grid cells, of which those are dug whose mean lies deep enough.
+    """
+    goal = np.asarray(goal, float)
+    task.finite(goal)
+    rows, columns = (n // layout.cell for n in goal.shape)
+    if not rows or not columns:
+        raise ValueError(
+            f"goal: got {list(goal.shape)} cells, fewer than the {layout.cell} of one step of the tool; give a finer goal"
+        )
+    blocks = (
+        goal[: rows * layout.cell, : columns * layout.cell].reshape(rows, layout.cell, columns, layout.cell).mean((1, 3))
+    )
+    dig = np.flipud(blocks < -layout.depth / 2)
+    if not dig.any():
+        raise ValueError(
+            f"goal: got no block of {layout.cell} x {layout.cell} cells below {-layout.depth / 2 * 1e3:.3g} mm, "
+            "so there is nothing to dig; lower the goal, or dig less deep"
+        )
+    scene = make_scene(goal.shape, layout.spacing, tool=layout.blade)
+    paths, optimal, lower = [], True, 0.0
+    for piece in connected_pieces(dig):
+        part = np.zeros_like(dig)
+        part[tuple(np.array(sorted(piece)).T)] = True
+        found = plan(part, seconds=10)
+        path = task.cell_centre(np.array(found.cells), rows, layout.cell, 0, layout.spacing)
+        paths.append(np.concatenate([path, path[-1:]]) if len(path) == 1 else path)
+        optimal, lower = optimal and found.optimal, lower + found.lower_bound
+    drawn = bool(np.all(goal <= 0))
+    return Target(name, kind, "plan", scene, goal, tuple(paths), drawn, layout.depth, optimal, lower)
+
+
+def glyph_target(strokes: np.ndarray, name: str) -> Target:
+    """A glyph's own strokes, pushed one by one; the goal is what they leave on level sand.
+
+    A glyph of the unit square takes 32 x 32 cells of 0.01 m; a wider text as many more columns as it needs.
+    """
+    blade, spacing = Blade(), 0.01
+    placed = task.place(strokes)
+    beyond = max(0.0, placed[:, [0, 2]].max() - task.GLYPH_SQUARE[1])
+    scene = make_scene((32, 32 + math.ceil(beyond / spacing - 1e-6)), spacing, tool=blade)
+    paths = tuple(stroke.reshape(2, 2) for stroke in placed)
+    goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, 2)
+    for path in paths:
+        shaped, _ = program(jnp.asarray(goal), jnp.asarray(path, np.float32))
+        check(shaped)
+        goal = np.asarray(shaped.height)
+    return Target(name, "glyph", "strokes", scene, goal, paths, False, float(blade.depth))
+
+
+def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> Target:
+    """A picture (0 to -1, row 0 at the bottom) as a height map of at most `cells` grid cells a side, plus the margin."""
+    scale = cells / max(picture.shape)
+    shape = [max(1, round(n * scale)) for n in picture.shape]
+    goal = np.pad(layout.depth * task.resample(picture, (shape[0], shape[1])), layout.margin)
+    return height_target(goal, "image", name, layout)
+
+
+def terrain_surface(shape: tuple[int, int], relief: float) -> np.ndarray:
+    """The terrain sample at another shape, around height 0, `relief` (m) from its lowest to its highest point."""
+    land = task.resample(goals.terrain(), shape)
+    return (land - np.median(land)) / (land.max() - land.min()) * relief
+
+
+def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda _: None) -> ShapeResult:
+    """Pushes a target's strokes on `before` [H, W] (m; level sand at 0 if None), which is settled first.
+
+    Raises:
+      OutcomeError: if the sand does not come to rest or something is not finite.
+    """
+    scene = target.scene
+    began = time.perf_counter()
+    start = at_rest(scene, before, tell)
+    prepared = time.perf_counter()
+    tell("compiling")
+    longest = max((len(path) for path in target.paths), default=2)
+    if longest > 2:  # a few lengths for all paths, so that like goals share a program
+        longest = -(-longest // 32) * 32
+    program, compile_seconds = _program(scene, longest)
+    compiled = time.perf_counter()
+    height, frames, tools = start, [start], [_nowhere()]
+    runs = []
+    for number, path in enumerate(target.paths, 1):
+        tell(f"pushing path {number} of {len(target.paths)}")
+        shaped, on_the_way = program(jnp.asarray(height), jnp.asarray(_padded(path, longest), np.float32))
+        check(shaped)
+        later = np.asarray(shaped.height)
+        runs.append((height, path, np.asarray(on_the_way), later))
+        height = later
+    ran = time.perf_counter()
+    tell("gathering frames")
+    for earlier, path, legs, later in runs:
+        ways, poses = _moments(scene, earlier, path, legs)
+        frames += [*ways, later]
+        tools += [*poses, _nowhere()]
+    seconds = {"prepare": prepared - began, "compile": compile_seconds, "run": ran - compiled}
+    figures = _figures(target, start, height)
+    return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), figures, seconds)
+
+
+def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
+    """A surface [H, W] (m; level sand at 0 if None) once it has settled."""
+    if before is None:
+        return np.zeros(scene.grid.shape, np.float32)
+    task.fits(scene, before)
+    tell("settling the surface")
+    rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
+    check(rested)
+    return np.asarray(rested.height)
+
+
+def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:
+    def reduction(view: Callable) -> float:
+        return float(task.l2_reduction(view(target.goal), view(before.astype(float)), view(after.astype(float))))
+
+    whole = reduction(lambda h: h)
+    return {
+        "iou": float(task.iou(target.goal, after, target.depth)),
+        "l2_reduction": reduction(lambda h: np.minimum(h, 0)) if target.drawn else whole,
+        "l2_reduction_with_berms": whole,
+        "volume_error": task.volume_error(before, after),
+        "max_slope_deg": math.degrees(math.atan(float(steepest_slope(target.scene, after)))),
+    }
+
+
+@cache
+def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]], float]:
+    """`follow_frames` for paths of a given number of points, compiled ahead, and the seconds that took."""
+    began = time.perf_counter()
+    height = jax.ShapeDtypeStruct(scene.grid.shape, np.float32)
+    path = jax.ShapeDtypeStruct((points, 2), np.float32)
+    program: Callable = jax.jit(partial(follow_frames, scene)).lower(height, path).compile()
+    return program, time.perf_counter() - began
+
+
+def _padded(path: np.ndarray, points: int) -> np.ndarray:
+    """The path with its last point repeated; a leg of no length does nothing."""
+    return np.concatenate([path, np.repeat(path[-1:], points - len(path), axis=0)])
+
+
+def _moments(scene: Scene, height: np.ndarray, path: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Maps on the way along a path, and the tool's pose in each: after every leg, or along a single stroke."""
+    if len(path) > 2:
+        runs = np.diff(path, axis=0)
+        return legs[: len(runs)], np.concatenate([path[1:], _headings(runs)], 1)
+    run = path[1] - path[0]
+    parts = np.linspace(0, 1, 7)[1:]
+    ends = np.stack([np.concatenate([path[0], path[0] + part * run]) for part in parts])
+    maps = jax.vmap(lambda stroke: act(scene, jnp.asarray(height), stroke, push=SteppedPush()).height)(jnp.asarray(ends))
+    return np.asarray(maps), np.concatenate([ends[:, 2:], np.repeat(_headings(run[None]), len(ends), 0)], 1)
+
+
+def _headings(runs: np.ndarray) -> np.ndarray:
+    lengths = np.hypot(runs[:, 0], runs[:, 1])[:, None]
+    return np.where(lengths > 0, runs / np.where(lengths > 0, lengths, 1), [1.0, 0.0])
+
+
+def _nowhere() -> np.ndarray:
+    return np.full(4, np.nan)

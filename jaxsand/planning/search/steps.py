@@ -1,0 +1,89 @@
+"""The search over paths with the tool down: layers of real maps, each with the place where the tool stands."""
+
+import jax
+import numpy as np
+
+from jaxsand.interaction.simulate import follow
+from jaxsand.planning.search.actions import Job, Path, corners
+from jaxsand.planning.search.rollouts import Effort, distance, distinct, marks, walked
+from jaxsand.relaxation.stopping import Outcome
+from jaxsand.scene.scene import Scene
+
+_MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+_GRAIN = 1 / 50  # of the largest height to change: what maps are told apart by
+_JUDGED = 12  # paths that are followed in full at the end
+Places = np.ndarray  # [n, 2]: row and column of corners
+
+
+def search_steps(job: Job, hint: Places, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
+    """The best path found for a job, at a cost of about `budget` full pushes of one leg each.
+
+    The places of the path `hint` are kept in every layer as far as they go, and the whole is judged with the others.
+    """
+    del rng  # nothing is drawn
+    width = max(1, int((budget - _JUDGED * job.strokes) / (4 * job.strokes)))
+    at = corners(job.scene, job.actions)
+    found, effort = in_layers(job, _starts(job, at, width), hint, width)
+    paths = [hint[: job.strokes + 1]] if len(hint) > 1 else []
+    paths += [path for _, path in sorted(found, key=lambda pair: pair[0])[: _JUDGED - len(paths)]]
+    followed = [follow_padded(job.scene, job.height, at[tuple(path.T)], job.strokes) for path in paths]
+    best = int(np.argmin(distance(np.stack([job.height, *followed]), job.goal)))
+    legs = sum(len(path) - 1 for path in paths)
+    return [at[tuple(paths[best - 1].T)]] if best else [], effort + Effort(full=legs)
+
+
+def in_layers(job: Job, starts: Places, hint: Places, width: int) -> tuple[list[tuple[float, Places]], Effort]:
+    """Best-first in layers from `starts` [n, 2]: the best paths of each layer, with how far they leave the sand (m).
+
+    A node is the map with the tool down, and its place. It is ranked by its map with the tool lifted; of the children of a
+    layer the `width` best are kept whose lifted maps or places differ. See `strokes.in_layers` for why order by distance is
+    A*'s order.
+    """
+    at = corners(job.scene, job.actions)
+    grain = _GRAIN * np.abs(job.height - job.goal).max()
+    down, paths = np.repeat(job.height[None], len(starts), axis=0), starts[:, None]
+    far = distance(down, job.goal)
+    found: list[tuple[float, Places]] = []
+    effort = Effort()
+    for _ in range(job.strokes):
+        parent = np.repeat(np.arange(len(paths)), 4)
+        place = paths[parent, -1] + np.tile(_MOVES, (len(paths), 1))
+        on = np.all((place >= 0) & (place < at.shape[:2]), axis=1)
+        parent, place = parent[on], place[on]
+        if not len(place):
+            break
+        legs = np.concatenate([at[tuple(paths[parent, -1].T)], at[tuple(place.T)]], axis=1)
+        after, lifted = walked(job.scene, down[parent], legs)
+        ends = distance(lifted, job.goal)
+        effort += Effort(full=len(legs), gain=float(np.max(far[parent] - ends)))
+        longer = np.concatenate([paths[parent], place[:, None]], axis=1)
+        order = np.argsort(np.where(_follows(longer, hint), -np.inf, ends), kind="stable")
+        names = [mark + spot.tobytes() for mark, spot in zip(marks(lifted, grain), place, strict=True)]
+        kept = distinct(names, parent, order, width, 4)
+        down, paths, far = after[kept], longer[kept], ends[kept]
+        found += [(float(far[i]), paths[i]) for i in np.argsort(far, kind="stable")[:_JUDGED]]
+    return found, effort
+
+
+def follow_padded(scene: Scene, height: np.ndarray, path: Path, legs: int) -> np.ndarray:
+    """What `follow` makes of a path of up to `legs` legs, by one program for all; NaN where the outcome is not clean."""
+    path = np.concatenate([path, np.repeat(path[-1:], legs + 1 - len(path), axis=0)])
+    shaped = jax.block_until_ready(follow(scene, np.asarray(height, np.float32), path.astype(np.float32)))
+    return np.asarray(shaped.height) if int(shaped.outcome) == Outcome(0) else np.full(height.shape, np.nan)
+
+
+def _starts(job: Job, at: np.ndarray, count: int) -> Places:
+    """The corners with the most sand to take away around them, where there is any."""
+    half = job.actions.cell // 2
+    rows, columns = np.floor(at[..., ::-1] / float(job.scene.grid.spacing)).astype(int).reshape(-1, 2).T
+    surplus = np.pad(np.maximum(job.height - job.goal, 0).astype(float), half)
+    window = 2 * half + 1
+    around = np.array([surplus[r : r + window, c : c + window].sum() for r, c in zip(rows, columns, strict=True)])
+    best = [i for i in np.argsort(-around, kind="stable")[:count] if around[i] > 0] or [0]
+    return np.stack(np.unravel_index(best, at.shape[:2]), axis=1)
+
+
+def _follows(paths: Places, hint: Places) -> np.ndarray:
+    """Which of the paths [n, k, 2] begin as the hint does."""
+    k = paths.shape[1]
+    return np.all(paths == hint[None, :k], axis=(1, 2)) if k <= len(hint) else np.zeros(len(paths), bool)

@@ -1,0 +1,126 @@
+"""The search over strokes with the tool lifted in between: layers of real maps, then better strokes one by one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxsand.planning.search.actions import Job, Path, confined, moved, propose
+from jaxsand.planning.search.rollouts import CHEAP, Effort, distance, distinct, marks, pushed, roughly_pushed
+from jaxsand.scene.scene import Scene
+
+_LAYERS = 0.25  # of the budget goes to the layers, half of it to rough pushes
+_GRAIN = 1 / 20  # of the largest height to change: what maps are told apart by
+_TRIED = 8  # variants of a plan, the best by rough pushes, are pushed in full
+_WIDTH = 8  # nodes that a layer keeps
+_CHILDREN = 2  # of one node among them
+_PLANS = 12  # strokes in all plans that are improved at first; one plan at last
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """`maps` [n, H, W] that plans [n, k, 4] lead to, closest to the goal first, and their `distance` [n] (m)."""
+
+    maps: np.ndarray
+    plans: np.ndarray
+    distance: np.ndarray
+
+
+def search_strokes(job: Job, hints: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
+    """The best strokes found for a job, at a cost of about `budget` full pushes. `hints` [m, 4] are tried in every layer."""
+    nodes, effort = in_layers(job, hints, _LAYERS * budget, _WIDTH, rng)
+    plan, more = improved(job, nodes.plans[: max(1, _PLANS // job.strokes)], budget - effort.cost, rng)
+    return [stroke.reshape(2, 2) for stroke in plan], effort + more
+
+
+def in_layers(job: Job, hints: np.ndarray, budget: float, width: int, rng: np.random.Generator) -> tuple[Nodes, Effort]:
+    """Best-first in layers: the nodes of a layer have taken equally many strokes.
+
+    In A*'s f = g + h, with h the distance to the goal over the most that one stroke can change, g is the same for a whole
+    layer and the divisor for all, so that order by f is order by distance. All children of a layer are pushed roughly, the
+    best of them in full, and of these the `width` best that differ are kept.
+    """
+    grain = _GRAIN * np.abs(job.height - job.goal).max()
+    nodes = Nodes(job.height[None], np.zeros((1, 0, 4)), distance(job.height[None], job.goal))
+    exact = max(2, int(budget / job.strokes / 2))
+    effort = Effort()
+    for _ in range(job.strokes):
+        share = max(2, int(exact / CHEAP / len(nodes.plans)) - len(hints))
+        ways = np.concatenate([[*propose(job.scene, job.actions, m, job.goal, share, rng), *hints] for m in nodes.maps])
+        parent = np.repeat(np.arange(len(nodes.plans)), share + len(hints))
+        rough = distance(roughly_pushed(job.scene, nodes.maps[parent], ways), job.goal)
+        best = np.argsort(rough, kind="stable")[:exact]
+        parent, ways = parent[best], ways[best]
+        maps = pushed(job.scene, nodes.maps[parent], ways)
+        far = distance(maps, job.goal)
+        effort += Effort(len(maps), len(rough), float(np.max(nodes.distance[parent] - far)))
+        most = width if len(nodes.plans) == 1 else _CHILDREN
+        kept = distinct(marks(maps, grain), parent, np.argsort(far, kind="stable"), width, most)
+        nodes = Nodes(maps[kept], np.concatenate([nodes.plans[parent], ways[:, None]], axis=1)[kept], far[kept])
+    return nodes, effort
+
+
+def improved(job: Job, plans: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[np.ndarray, Effort]:
+    """The best of some plans [m, n, 4], after their strokes were varied one at a time.
+
+    Variants of a stroke are ranked by pushing them, and what follows, roughly: what a variant is expected to leave is the
+    map that the plan leaves, plus the difference that the rough push makes between the two. The best are pushed in full.
+    Plans that lag behind are given up on the way. At last strokes at the end that do not help are left out.
+    """
+    count = plans.shape[1]
+    ways = [finish(job.scene, plan[None], 0, job.height[None])[:, 0] for plan in plans]
+    plans, effort = plans.copy(), Effort(plans.size // 4)
+    far = np.array([distance(way[-1], job.goal) for way in ways])
+    turn = 0
+    while effort.cost < budget:
+        racing = np.argsort(far, kind="stable")[: max(1, round(len(plans) * (1 - 1.3 * effort.cost / budget)))]
+        a, k = racing[turn % len(racing)], int(rng.integers(count))
+        turn += 1
+        anew = turn % (2 * count) == 0  # three times as dear as another turn
+        tried = _far(job, plans[a], k, ways[a], rng) if anew else _near(job, plans[a], k, rng)
+        rough = finish(job.scene, np.concatenate([plans[a][None], tried]), k, ways[a][k][None], roughly_pushed)[-1]
+        hoped = distance(ways[a][-1] + (rough[1:] - rough[0]), job.goal)
+        tried = tried[np.argsort(hoped, kind="stable")[:_TRIED]]
+        after = finish(job.scene, tried, k, ways[a][k][None])
+        ends = distance(after[-1], job.goal)
+        steps = distance(after, job.goal)
+        gain = float(np.nanmax(steps[:-1] - steps[1:]))
+        effort += Effort(len(tried) * (count - k), len(rough) * (count - k), gain)
+        best = int(ends.argmin())
+        if ends[best] < far[a]:
+            far[a], plans[a], ways[a] = ends[best], tried[best], np.concatenate([ways[a][:k], after[:, best]])
+    best = int(far.argmin())
+    return plans[best][: int(distance(ways[best], job.goal).argmin())], effort
+
+
+def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push: Callable = pushed) -> np.ndarray:
+    """The maps on the way of plans [m, n, 4] from stroke `first` on, [n - first + 1, m, H, W], from `start` [1, H, W]."""
+    maps = [np.repeat(start, len(plans), axis=0)]
+    for k in range(first, plans.shape[1]):
+        maps.append(push(scene, maps[-1], plans[:, k]))
+    return np.stack(maps)
+
+
+def _near(job: Job, plan: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
+    """Plans [31, n, 4] that differ from `plan` [n, 4] in that stroke k is moved a little; in one it is reversed, and in one
+    it trades places with the next."""
+    some = np.repeat(plan[None], 31, axis=0)
+    some[:, k] = moved(job.scene, job.actions, some[:, k], rng)
+    some[0, k] = plan[k][[2, 3, 0, 1]]
+    if k + 1 < len(plan):
+        some[1] = plan[[*range(k), k + 1, k, *range(k + 2, len(plan))]]
+    return some
+
+
+def _far(job: Job, plan: np.ndarray, k: int, way: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Plans [255, n, 4] in which stroke k is a new one, or left out and a new one added at the end, or joined with the next
+    so that there is room for a new one. New ones are proposed by the maps on the `way` of the plan, before k and at its end.
+    """
+    some = np.repeat(plan[None], 255, axis=0)
+    early, late = (propose(job.scene, job.actions, m, job.goal, 128, rng) for m in (way[k], way[-1]))
+    some[:128, k], some[128:, k] = early, late[:127]
+    some[64:128] = np.concatenate([np.repeat(np.delete(plan, k, axis=0)[None], 64, axis=0), late[64:, None]], axis=1)
+    if k + 1 < len(plan):
+        joined = np.concatenate([plan[k, :2], plan[k + 1, 2:]])[None]
+        some[192:, k + 1] = confined(job.scene, job.actions, joined)
+    return some

@@ -1,0 +1,145 @@
+"""Tasks on real sand in which the binary model of dug and not dug is wrong: berms count, order counts, or nothing is dug."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from jaxsand.goals import letters as goals
+from jaxsand.goals import metrics as task
+from jaxsand.interaction.simulate import check
+from jaxsand.planning.search.actions import Actions, Lattice, Steps
+from jaxsand.planning.search.rollouts import replay
+from jaxsand.relaxation.settling import settle
+from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.tools import Blade
+
+_SHAPE, _SPACING = (32, 32), 0.01
+
+
+@dataclass(frozen=True)
+class SandTask:
+    """A map [H, W] (m) at rest, the goal [H, W] (m), compared whole, and how many strokes or legs of which kind."""
+
+    name: str
+    scene: Scene
+    height: np.ndarray
+    goal: np.ndarray
+    strokes: int
+    actions: Actions
+
+
+@cache
+def sand_task(name: str) -> SandTask:
+    """The task of a name in `SAND_TASKS`, on 32 x 32 cells of 0.01 m."""
+    if name not in SAND_TASKS:
+        raise ValueError(f"task: got {name!r}; give one of {', '.join(SAND_TASKS)}")
+    return SAND_TASKS[name]()
+
+
+def _crossing() -> SandTask:
+    """Three trenches that cross: each pushes its berm into those dug before."""
+    return _drawn("crossing", [[0.06, 0.16, 0.26, 0.16], [0.16, 0.06, 0.16, 0.26], [0.08, 0.08, 0.24, 0.24]])
+
+
+def _twin() -> SandTask:
+    """Two trenches so close that the berm of the second falls into the first."""
+    return _drawn("twin trenches", [[0.06, 0.14, 0.26, 0.14], [0.26, 0.175, 0.06, 0.175]])
+
+
+def _zigzag() -> SandTask:
+    """Three strokes of a zigzag and one across them."""
+    strokes = [[0.06, 0.08, 0.26, 0.12], [0.26, 0.12, 0.06, 0.17], [0.06, 0.17, 0.26, 0.22], [0.16, 0.05, 0.16, 0.27]]
+    return _drawn("zigzag", strokes)
+
+
+def _frame() -> SandTask:
+    """A closed square of four trenches, whose last stroke fills a corner of the first."""
+    strokes = [[0.08, 0.08, 0.24, 0.08], [0.24, 0.08, 0.24, 0.24], [0.24, 0.24, 0.08, 0.24], [0.08, 0.24, 0.08, 0.08]]
+    return _drawn("frame", strokes)
+
+
+def _ridge() -> SandTask:
+    """A trench at the foot of a ridge that is to stay, its sand on the far side alone; no strokes reach that."""
+    scene = _scene(Blade())
+    x, y = _places()
+    ridge = _at_rest(scene, 0.02 * ((np.abs(y - 0.19) < 0.015) & (np.abs(x - 0.16) < 0.11)))
+    level = np.zeros(_SHAPE, np.float32)
+    trench = np.where(y < 0.145, replay(scene, level, [np.array([[0.06, 0.13], [0.26, 0.13]])]), 0)
+    return SandTask("trench by a ridge", scene, ridge, ridge + trench - trench.mean(), 3, Lattice())
+
+
+def _pit() -> SandTask:
+    """A heap beside a pit of its size: level, with a blade that scrapes at height 0."""
+    x, y = _places()
+    pit = 0.03 * (np.hypot(x - 0.1, y - 0.16) < 0.04) - 0.03 * (np.hypot(x - 0.21, y - 0.16) < 0.04)
+    return _levelling("pit from a heap", pit, 8)
+
+
+def _rough() -> SandTask:
+    """A rough surface: level."""
+    rough = np.random.default_rng(5).normal(size=_SHAPE)
+    for _ in range(8):
+        p = np.pad(rough, 1, mode="edge")
+        rough = (2 * p[1:-1, 1:-1] + p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 6
+    return _levelling("rough surface", 0.012 * rough / np.abs(rough).max(), 12)
+
+
+def _terrain() -> SandTask:
+    """A patch of real terrain, of 3 cm relief: level."""
+    land = task.resample(goals.terrain()[100:200, 100:200], _SHAPE)
+    return _levelling("terrain", 0.03 * (land - np.median(land)) / (land.max() - land.min()), 12)
+
+
+def _stem() -> SandTask:
+    """The letter T in one path, as it is written: along the bar, back to its middle, down the stem."""
+    steps = Steps(cell=3, margin=1)
+    side = 1.15 * steps.cell * _SPACING
+    scene = _scene(Blade(side, side, 0.003))
+    places = [(8, c) for c in range(1, 9)] + [(8, c) for c in range(7, 4, -1)] + [(r, 5) for r in range(7, 0, -1)]
+    path = (steps.margin + (np.array(places)[:, ::-1] + 0.5) * steps.cell) * _SPACING
+    level = np.zeros(_SHAPE, np.float32)
+    return SandTask("T in one path", scene, level, replay(scene, level, [path]), len(places) - 1, steps)
+
+
+SAND_TASKS: dict[str, Callable[[], SandTask]] = {
+    "crossing": _crossing,
+    "twin": _twin,
+    "zigzag": _zigzag,
+    "frame": _frame,
+    "ridge": _ridge,
+    "pit": _pit,
+    "rough": _rough,
+    "terrain": _terrain,
+    "stem": _stem,
+}
+"""Tasks by short name; `sand_task` builds one."""
+
+
+def _drawn(name: str, strokes: list[list[float]]) -> SandTask:
+    """The goal is what some strokes leave on level sand, berms and all."""
+    scene, level = _scene(Blade()), np.zeros(_SHAPE, np.float32)
+    goal = replay(scene, level, [np.array(stroke).reshape(2, 2) for stroke in strokes])
+    return SandTask(name, scene, level, goal, len(strokes), Lattice())
+
+
+def _levelling(name: str, height: np.ndarray, strokes: int) -> SandTask:
+    scene = _scene(Blade(width=0.04, thickness=0.015, depth=0.0))
+    height = _at_rest(scene, height)
+    return SandTask(name, scene, height - height.mean(), np.zeros(_SHAPE), strokes, Lattice())
+
+
+def _scene(blade: Blade) -> Scene:
+    return make_scene(_SHAPE, _SPACING, tool=blade)
+
+
+def _at_rest(scene: Scene, height: np.ndarray) -> np.ndarray:
+    settled = settle(scene, height.astype(np.float32))
+    check(settled)
+    return np.asarray(settled.height)
+
+
+def _places() -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.meshgrid((np.arange(_SHAPE[1]) + 0.5) * _SPACING, (np.arange(_SHAPE[0]) + 0.5) * _SPACING)
+    return x, y
