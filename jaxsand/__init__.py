@@ -57,7 +57,7 @@ _HOMES = {
     "check": "interaction.simulate",
     "follow": "interaction.simulate",
     "follow_frames": "interaction.simulate",
-    "make": "env",
+    "make": "envs",
     "make_scene": "scene.scene",
     "optimise_strokes": "planning.gradient",
     "plan": "planning.binary",

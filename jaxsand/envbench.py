@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxsand.env import LevelGoals, OnSand, Together, Walks, make, pool_of
+from jaxsand.envs import LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.planning.stroke_loss import pushed
 from jaxsand.relaxation._batching import wide_vectors
@@ -143,7 +143,7 @@ def _error(loose: Any, env: Any, params: Any) -> float:
 def _gymnasium(kind: str, options: dict[str, Any]) -> list[Contender]:
     """A single environment, step by step, as an agent's loop has it; nothing without Gymnasium."""
     try:
-        from jaxsand.gym import MultiStrokeEnv, SingleStrokeEnv
+        from jaxsand.envs.gymnasium import MultiStrokeEnv, SingleStrokeEnv
     except ImportError:
         return []
     env = (MultiStrokeEnv if kind in (_FULL, _FAST) else SingleStrokeEnv)(**options)

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 import jaxsand as js
-from jaxsand import env as envs
-from jaxsand.env.pushing import Together
+from jaxsand import envs
+from jaxsand.envs.pushing import Together
 from jaxsand.goals import letters as goals
 
 KEY = jax.random.key(0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams, StrokeState
+from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams, StrokeState
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.strokegoals import usual_scene

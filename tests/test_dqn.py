@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsand.env.maps import STEPS, map_pool
-from jaxsand.env.onmap import MapParams, OnMap
+from jaxsand.envs.maps import STEPS, map_pool
+from jaxsand.envs.onmap import MapParams, OnMap
 from jaxsand.goals import letters as goals
 from train.backup import Every, Items, Sampled, items_of
 from train.dqn import Dqn, begin, practise

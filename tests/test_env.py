@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand import env as envs
-from jaxsand.env.pushing import ByLength, sorted_by_length
+from jaxsand import envs
+from jaxsand.envs.pushing import ByLength, sorted_by_length
 
 from .env_cases import KEY, QUICK, SMALL, on_sand, program, small, walks
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.env.pushing import ByLength, Together, by_length
+from jaxsand.envs.pushing import ByLength, Together, by_length
 
 from .env_cases import KEY, LINES, SMALL
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.env import LevelGoals, OnSand, map_pool
+from jaxsand.envs import LevelGoals, OnSand, map_pool
 
 SLOW = pytest.mark.slow
 SOLID = np.zeros((8, 8), bool)

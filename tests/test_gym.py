@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import jaxsand.gym
-from jaxsand.env import LevelGoals, OnlyDug, OnSand, Stop, Together, map_pool
+from jaxsand.envs import LevelGoals, OnlyDug, OnSand, Stop, Together, map_pool
 from jaxsand.goals.letters import letter_map
 from jaxsand.interaction.blade_stepped import SteppedPush
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand import env as envs
-from jaxsand.env.pushing import ByLength
+from jaxsand import envs
+from jaxsand.envs.pushing import ByLength
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
 from jaxsand.relaxation.settling import steepest_slope

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsand as js
-from jaxsand import env as envs
+from jaxsand import envs
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
+from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.strokegoals import CELLS
 from train.nets import Actor, Critic

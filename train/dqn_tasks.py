@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.env.maps import MapPool
-from jaxsand.env.onmap import MapParams, MapState, OnMap
+from jaxsand.envs.maps import MapPool
+from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.goals import letters as goals
 from train.evaluate_maps import fewest, walks
 from train.probes import Probe, ProbeState, Two

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.env.maps import STEPS, MapPool, map_pool
-from jaxsand.env.onmap import MapParams, OnMap
+from jaxsand.envs.maps import STEPS, MapPool, map_pool
+from jaxsand.envs.onmap import MapParams, OnMap
 from jaxsand.goals import letters as goals
 from jaxsand.planning.binary import Cell, plan
 from train.qnet import Greedy, best, of

@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand.env import episode
-from jaxsand.env.episode import Step
-from jaxsand.env.spaces import Box, Discrete
+from jaxsand.envs import episode
+from jaxsand.envs.episode import Step
+from jaxsand.envs.spaces import Box, Discrete
 
 
 @dataclass(frozen=True)

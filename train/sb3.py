@@ -52,7 +52,7 @@ def trained(steps: int, seed: int) -> dict[str, float]:
     import gymnasium
 
     import jaxsand.gym
-    from jaxsand.env import RandomStrokes
+    from jaxsand.envs import RandomStrokes
 
     env = gymnasium.make(jaxsand.gym.MULTI, goals=RandomStrokes(goals=64, most=_LIMIT), limit=_LIMIT, seed=seed)
     check_env(env.unwrapped, warn=False)  # which also compiles its programs

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.env.maps import STEPS, MapPool
+from jaxsand.envs.maps import STEPS, MapPool
 
 _FEWEST, _MOST = 6, 16  # lines
 _SHORTEST, _LONGEST = 2, 6  # steps of a line

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.env.library import RandomStrokes
-from jaxsand.env.multi import LevelGoals, MultiStroke, StrokeParams
+from jaxsand.envs.library import RandomStrokes
+from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.goals import metrics as task
 from jaxsand.goals.layout import right
 from jaxsand.planning.learned.beam_search import one_after_the_other

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.env.maps import STEPS
+from jaxsand.envs.maps import STEPS
 from jaxsand.planning.learned._square_symmetries import turned_back as turned
 from train.qnet import Greedy
 

@@ -6,10 +6,10 @@ The state of an episode is apart from the parameters, whose leaves may be vmappe
 from dataclasses import fields
 from typing import Any
 
-from jaxsand.env.checks import check_kinds, check_limit, check_ready_goals, check_scene
-from jaxsand.env.library import Level, RandomStrokes, Rough, library
-from jaxsand.env.maps import MapPool, Walks, map_pool, pool_of
-from jaxsand.env.multi import (
+from jaxsand.envs.checks import check_kinds, check_limit, check_ready_goals, check_scene
+from jaxsand.envs.library import Level, RandomStrokes, Rough, library
+from jaxsand.envs.maps import MapPool, Walks, map_pool, pool_of
+from jaxsand.envs.multi import (
     LevelGoals,
     MultiStroke,
     NoStop,
@@ -20,10 +20,10 @@ from jaxsand.env.multi import (
     StrokeState,
     WithBerms,
 )
-from jaxsand.env.onmap import MapParams, MapState, OnMap
-from jaxsand.env.onsand import OnSand, SandParams, SandState
-from jaxsand.env.pushing import ByLength, Together
-from jaxsand.env.spaces import Box, Dict, Discrete
+from jaxsand.envs.onmap import MapParams, MapState, OnMap
+from jaxsand.envs.onsand import OnSand, SandParams, SandState
+from jaxsand.envs.pushing import ByLength, Together
+from jaxsand.envs.spaces import Box, Dict, Discrete
 from jaxsand.interaction.blade_stepped import SteppedPush, with_near
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene

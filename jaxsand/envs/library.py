@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from jaxsand.env.multi import LevelGoals, MultiStroke, RoughGoals
-from jaxsand.env.pushing import Pushing
+from jaxsand.envs.multi import LevelGoals, MultiStroke, RoughGoals
+from jaxsand.envs.pushing import Pushing
 from jaxsand.goals import metrics as task
 from jaxsand.goals.letters import stroke_list
 from jaxsand.interaction.simulate import check

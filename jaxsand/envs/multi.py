@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand.env import episode
-from jaxsand.env.episode import Step
-from jaxsand.env.pushing import Batching, ByLength, Push
-from jaxsand.env.spaces import Box, Dict
+from jaxsand.envs import episode
+from jaxsand.envs.episode import Step
+from jaxsand.envs.pushing import Batching, ByLength, Push
+from jaxsand.envs.spaces import Box, Dict
 from jaxsand.goals import metrics as task
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule

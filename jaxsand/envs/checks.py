@@ -4,11 +4,11 @@ from typing import Any, get_args
 
 import numpy as np
 
-from jaxsand.env.maps import MapGoals
-from jaxsand.env.multi import LevelGoals, NoStop, OnlyDug, RoughGoals, Stop, WithBerms
-from jaxsand.env.onmap import OnMap
-from jaxsand.env.onsand import OnSand
-from jaxsand.env.pushing import Batching, Push
+from jaxsand.envs.maps import MapGoals
+from jaxsand.envs.multi import LevelGoals, NoStop, OnlyDug, RoughGoals, Stop, WithBerms
+from jaxsand.envs.onmap import OnMap
+from jaxsand.envs.onsand import OnSand
+from jaxsand.envs.pushing import Batching, Push
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of, concrete
 

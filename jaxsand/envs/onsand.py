@@ -6,11 +6,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand.env import episode
-from jaxsand.env.episode import Step
-from jaxsand.env.maps import MapGoals, Walks
-from jaxsand.env.onmap import MapParams, MapState, OnMap
-from jaxsand.env.spaces import Box, Dict, Discrete
+from jaxsand.envs import episode
+from jaxsand.envs.episode import Step
+from jaxsand.envs.maps import MapGoals, Walks
+from jaxsand.envs.onmap import MapParams, MapState, OnMap
+from jaxsand.envs.spaces import Box, Dict, Discrete
 from jaxsand.goals import metrics as task
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import act

@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsand.env import episode
-from jaxsand.env.episode import Step
-from jaxsand.env.maps import STEPS, MapGoals, Walks
-from jaxsand.env.spaces import Box, Dict, Discrete
+from jaxsand.envs import episode
+from jaxsand.envs.episode import Step
+from jaxsand.envs.maps import STEPS, MapGoals, Walks
+from jaxsand.envs.spaces import Box, Dict, Discrete
 
 
 @jax.tree_util.register_dataclass

@@ -1,0 +1,274 @@
+"""Gymnasium's interface to the environments: import this module, then `gymnasium.make` or `gymnasium.make_vec`.
+
+    import gymnasium
+    import jaxsand.gym
+
+    env = gymnasium.make("jaxsand/MultiStroke-v0", render_mode="rgb_array")
+    envs = gymnasium.make_vec("jaxsand/SingleStroke-v0", num_envs=64)
+
+Options are those of `jaxsand.make`. A vector of environments is one vmapped program; it begins a new episode in the step
+that ends the old one (AutoresetMode.SAME_STEP: info["final_obs"] holds the old one's last observation). A single one does
+not begin anew by itself.
+
+Needs the extra `gym`: pip install 'jaxsand[gym]'.
+"""
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, ClassVar
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from jaxsand.envs import Box, MultiStroke, OnMap, make
+
+SINGLE, MULTI = "jaxsand/SingleStroke-v0", "jaxsand/MultiStroke-v0"
+_LOW, _LEVEL, _HIGH, _TOOL = (np.array(c, float) for c in ((30, 60, 130), (222, 196, 150), (110, 60, 20), (200, 30, 30)))
+_PIXELS = 256  # along a panel of a picture, about
+
+Obs = dict[str, Any]
+
+
+def _known(space: Any, actions: Any, shape: tuple[int, ...]) -> None:
+    """Raises ValueError for actions of another shape, and for a step that is none of the four."""
+    try:
+        given = np.asarray(actions)
+    except ValueError:
+        raise ValueError(f"action: got {actions!r:.60}; give numbers {list(shape)}") from None
+    if given.dtype.kind not in "fiu" or given.shape != shape:
+        raise ValueError(f"action: got {given.dtype} of shape {list(given.shape)}; give numbers {list(shape)}")
+    if isinstance(space, spaces.Discrete) and (given.dtype.kind == "f" or (given < 0).any() or (given >= space.n).any()):
+        raise ValueError(f"action: got {actions!r}; give 0 to {space.n - 1}: north, east, south, west")
+
+
+class _Sand(gymnasium.Env):
+    """One environment: `core` and `params` as `jaxsand.make` gives them, and the `state` of its episode."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+    task: ClassVar[str]
+
+    def __init__(self, render_mode: str | None = None, **options: Any) -> None:
+        self.render_mode = _renders(render_mode)
+        self.core, self.params = make(self.task, **options)
+        self.observation_space, self.action_space = _spaces(self.core, self.params)
+        self.state: Any = None
+        self.shown: Obs = {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        super().reset(seed=seed, options=options)
+        obs, self.state, about = _alone(self.core)[0](_key(self.np_random), self.params)
+        self.shown = _arrays(obs)
+        return _view(self.shown), _arrays(about)
+
+    def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        _known(self.action_space, action, self.action_space.shape or ())
+        # No environment draws anything in a step: any key will do.
+        out = _alone(self.core)[1](jax.random.key(0), self.state, np.asarray(action), self.params)
+        obs, self.state, reward, terminated, truncated, info = out
+        self.shown = _arrays(obs)
+        return _view(self.shown), float(reward), bool(terminated), bool(truncated), _arrays(info)
+
+    def render(self) -> Any:
+        """A picture of goal and sand side by side, [height, width, 3] (uint8); None unless render_mode is rgb_array."""
+        if self.render_mode is None:
+            return None
+        return picture(self.core, self.shown)
+
+
+class SingleStrokeEnv(_Sand):
+    """Observations are the planes "goal", "current" and "pose"; actions 0 to 3 are N, E, S, W, of which info["action_mask"]
+    says which lead on (`info["legal"]`: whether the last one did)."""
+
+    task = "single-stroke"
+
+
+class MultiStrokeEnv(_Sand):
+    """Observations are "observation" and "achieved_goal", both the sand as it lies, and "desired_goal": maps [H, W] in units
+    of the blade's depth. An action holds x0, y0, x1, y1 from -1 to 1; numbers beyond push from off the map.
+
+    The reward L_t - L_{t+1} depends on the map before the push, which is in info["previous"]: so who relabels goals must
+    keep the infos (Stable-Baselines3: replay_buffer_kwargs={"copy_info_dict": True}).
+    """
+
+    task = "multi-stroke"
+
+    def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        previous = self.shown["current"]
+        obs, _, terminated, truncated, info = super().step(action)
+        info["previous"] = previous
+        reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], info))
+        return obs, reward, terminated, truncated, info
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """The reward for having made `achieved_goal` [H, W] or [B, H, W] of info["previous"] when `desired_goal` was the
+        goal: a number, or [B] for B infos. Exactly that of `step` for the goal that was given.
+
+        Raises:
+          ValueError: if an info does not hold the map before the push.
+        """
+        single = np.ndim(achieved_goal) == 2
+        infos = [info] if single else list(info)
+        if not all("previous" in one for one in infos):
+            raise ValueError(
+                "info: got one without 'previous', the map before the push; keep the infos of `step` "
+                "(Stable-Baselines3: replay_buffer_kwargs={'copy_info_dict': True})"
+            )
+        before = np.stack([one["previous"] for one in infos])
+        goal = np.asarray(desired_goal).reshape(before.shape)
+        after = np.asarray(achieved_goal).reshape(before.shape)
+        reward = self._distance(goal, before) - self._distance(goal, after)
+        return reward[0] if single else reward
+
+    def _distance(self, goal: np.ndarray, maps: np.ndarray) -> np.ndarray:
+        seen = self.core.measure.seen
+        apart = np.asarray(seen(goal), float) - np.asarray(seen(maps), float)
+        return np.sqrt(np.sum(apart.reshape(len(apart), -1) ** 2, axis=1))
+
+
+class SandVectorEnv(VectorEnv):
+    """Many environments as one vmapped program; see the single ones."""
+
+    metadata: dict[str, Any] = _Sand.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(self, task: str, num_envs: int, render_mode: str | None = None, **options: Any) -> None:
+        self.num_envs, self.render_mode = num_envs, _renders(render_mode)
+        self.core, self.params = make(task, **options)
+        self.single_observation_space, self.single_action_space = _spaces(self.core, self.params)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.state: Any = None
+        self.shown: Obs = {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """With a seed, the i-th environment begins as a single one with `seed` + i does."""
+        super().reset(seed=seed, options=options)
+        own = [self.np_random if seed is None else np_random(seed + i)[0] for i in range(self.num_envs)]
+        obs, self.state, about = _together(self.core)[0](jax.numpy.stack([_key(one) for one in own]), self.params)
+        self.shown = _arrays(obs)
+        return _view(self.shown), _masked(_arrays(about), np.ones(self.num_envs, bool))
+
+    def step(self, actions: Any) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        _known(self.single_action_space, actions, self.action_space.shape or ())
+        keys = jax.random.split(_key(self.np_random), self.num_envs)
+        out = _together(self.core)[1](keys, self.state, np.asarray(actions), self.params)
+        obs, self.state, *rest, info = out
+        reward, terminated, truncated = (np.asarray(x) for x in rest)
+        info, over = _arrays(info), terminated | truncated
+        last = _view({name: np.asarray(x) for name, x in info.pop("final_observation").items()})
+        del info["terminated"], info["truncated"]
+        infos = {}
+        if "action_mask" in info:  # of the state as it is now
+            infos = _masked({"action_mask": info.pop("action_mask")}, np.ones(self.num_envs, bool))
+        else:
+            info["previous"] = self.shown["current"]
+        infos |= _masked(info, ~over)
+        if over.any():
+            final = np.full(self.num_envs, None, object)
+            for i in np.flatnonzero(over):
+                final[i] = {name: plane[i] for name, plane in last.items()}
+            infos |= {"final_obs": final, "_final_obs": over, "final_info": _masked(info, over), "_final_info": over}
+        self.shown = _arrays(obs)
+        return _view(self.shown), reward.astype(float), terminated, truncated, infos
+
+    def render(self) -> Any:
+        """A picture of each environment; None unless render_mode is rgb_array."""
+        if self.render_mode is None:
+            return None
+        return tuple(picture(self.core, {name: x[i] for name, x in self.shown.items()}) for i in range(self.num_envs))
+
+
+def picture(core: Any, shown: Obs) -> np.ndarray:
+    """Goal and sand [height, width, 3] (uint8): blue is a blade's depth down, brown as far up, red where the tool stands."""
+    on_map = isinstance(core, OnMap)
+    panels = [_coloured(-shown[name] if on_map else shown[name]) for name in ("goal", "current")]
+    if "pose" in shown:
+        share = shown["pose"][..., None] * 0.7
+        panels[1] = panels[1] * (1 - share) + _TOOL * share
+    rows = panels[0].shape[0]
+    gap = np.full((rows, 1, 3), 255.0)
+    whole = np.concatenate([panels[0], gap, panels[1]], axis=1)
+    if not on_map:
+        whole = np.flipud(whole)
+    scale = max(1, _PIXELS // rows)
+    return np.repeat(np.repeat(whole, scale, 0), scale, 1).round().astype(np.uint8)
+
+
+def _renders(mode: str | None) -> str | None:
+    """The mode, if there is such a one."""
+    if mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode: got {mode!r}; give rgb_array or None")
+    return mode
+
+
+def _coloured(height: np.ndarray) -> np.ndarray:
+    part = np.clip(height, -1, 1)[..., None]
+    return _LEVEL + np.maximum(-part, 0) * (_LOW - _LEVEL) + np.maximum(part, 0) * (_HIGH - _LEVEL)
+
+
+def _spaces(core: Any, params: Any) -> tuple[spaces.Space, spaces.Space]:
+    shown, action = core.observation_space(params).spaces, core.action_space(params)
+    observation = spaces.Dict(_view({name: _box(box) for name, box in shown.items()}))
+    return observation, _box(action) if isinstance(action, Box) else spaces.Discrete(action.n)
+
+
+def _box(box: Box) -> spaces.Box:
+    return spaces.Box(float(box.low), float(box.high), box.shape, np.float32)
+
+
+def _view(shown: Obs) -> Obs:
+    """What the environment shows as Gymnasium's users know it: as a goal dictionary where strokes are free."""
+    if "pose" in shown:
+        return dict(shown)
+    return {"observation": shown["current"], "achieved_goal": shown["current"], "desired_goal": shown["goal"]}
+
+
+def _arrays(tree: Obs) -> Obs:
+    return {name: x if isinstance(x, dict) else np.asarray(x) for name, x in tree.items()}
+
+
+def _masked(info: dict[str, Any], which: np.ndarray) -> dict[str, Any]:
+    """What every environment has to say, with Gymnasium's mark of those for which it holds."""
+    return info | {f"_{name}": which for name in info}
+
+
+def _key(random: np.random.Generator) -> jax.Array:
+    return jax.random.key(int(random.integers(2**31)))
+
+
+@cache
+def _programs(core: Any, step: Any) -> tuple[Callable, Callable]:
+    """`reset` and a step of one environment, with the mask of actions where it has one."""
+
+    def about(state: Any, params: Any) -> Obs:
+        return {} if isinstance(core, MultiStroke) else {"action_mask": core.legal(state, params).astype(np.int8)}
+
+    def begin(key: jax.Array, params: Any) -> tuple[Any, Any, Obs]:
+        obs, state = core.reset(key, params)
+        return obs, state, about(state, params)
+
+    def go_on(key: jax.Array, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
+        *out, info = step(core, key, state, action, params)
+        return *out, info | about(out[1], params)
+
+    return begin, go_on
+
+
+@cache
+def _alone(core: Any) -> tuple[Any, Any]:
+    begin, go_on = _programs(core, type(core).step_env)
+    return jax.jit(begin), jax.jit(go_on)
+
+
+@cache
+def _together(core: Any) -> tuple[Any, Any]:
+    begin, go_on = _programs(core, type(core).step)
+    return jax.jit(jax.vmap(begin, (0, None))), jax.jit(jax.vmap(go_on, (0, 0, 0, None)))
+
+
+for _name, _single in ((SINGLE, SingleStrokeEnv), (MULTI, MultiStrokeEnv)):
+    gymnasium.register(_name, entry_point=_single, vector_entry_point=partial(SandVectorEnv, _single.task))
