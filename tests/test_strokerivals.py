@@ -14,9 +14,9 @@ from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.window import Window
 from jaxsand.strokebench import reached, run_all
-from jaxsand.strokefigures import strokes_figure
 from jaxsand.strokegoals import letters_on_rough_sand, many_strokes, stroke_goal, turned_letters
 from jaxsand.strokerivals import RIVALS, random_shooting
+from jaxsand.viz.strokes import strokes_figure
 
 BOUNDS = np.array([[0.0, 0.0, 0.0, 0.0], [0.3, 0.2, 0.3, 0.2]])
 SPOTS = np.array([[0.1, 0.05, 0.2, 0.15], [0.25, 0.1, 0.05, 0.02]])

@@ -136,7 +136,7 @@ def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], Non
     stages = Stages(options.lookahead or 0, _POLISH if options.refine else 0)
     report = evaluate(policy, glyphs, stages, tell)
     if out:
-        from jaxsand.render import save_figure
+        from jaxsand.viz.render import save_figure
 
         write_json(out / _REPORT, report)
         with written(out / "evaluate.png") as path:

@@ -10,8 +10,8 @@ from jaxsand.goals import metrics as task
 from jaxsand.goals.layout import right, strict, strokes_right
 from jaxsand.planning.learned.beam_search import Proposes
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
-from jaxsand.strokefigures import found_figure
 from jaxsand.strokegoals import StrokeGoal
+from jaxsand.viz.strokes import found_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,7 +18,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
     strokes = _of_strokes(options)
     report = bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
     if out:
-        from jaxsand.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
+        from jaxsand.viz.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
 
         if report.get("work_precision"):
             with written(out / f"bench-{options.what}.png") as path:
@@ -29,13 +29,13 @@ def run_benchmark(options: argparse.Namespace) -> None:
             with written(out / "bench-plan-alpha.png") as path:
                 save_figure(alpha_figure(report), path)
         if "trench_by_spacing" in report:
-            from jaxsand.rutfigures import spacing_figure
+            from jaxsand.viz.trenches import spacing_figure
 
             with written(out / "bench-trench.png") as path:
                 save_figure(spacing_figure(report["trench_by_spacing"]), path)
         if "strokes_curves" in report:
             from jaxsand.strokebench import REACHED, found
-            from jaxsand.strokefigures import found_figure, strokes_figure
+            from jaxsand.viz.strokes import found_figure, strokes_figure
 
             with written(out / "bench-strokes.png") as path:
                 save_figure(strokes_figure(report["strokes_curves"], REACHED), path)

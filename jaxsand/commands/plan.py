@@ -45,7 +45,7 @@ def run_plan(options: argparse.Namespace) -> None:
         "seconds": time.perf_counter() - began,
     }
     if out:
-        from jaxsand.render import plan_figure, save_figure
+        from jaxsand.viz.render import plan_figure, save_figure
 
         stem = plain_name(options.map)
         files = [out / f"plan-{stem}.{suffix}" for suffix in ("png", "json")]

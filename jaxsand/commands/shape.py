@@ -25,7 +25,7 @@ def run_shape(options: argparse.Namespace) -> None:
     tell("reading the goal")
     from jaxsand.planning.methods import by_policy, optimised, searched
     from jaxsand.planning.pipeline import shape
-    from jaxsand.render import save_animation, save_figure, shape_figure
+    from jaxsand.viz.render import save_animation, save_figure, shape_figure
 
     began = time.perf_counter()
     looks = options.method in ("search", "optimise", "policy")

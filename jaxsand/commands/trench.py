@@ -28,8 +28,8 @@ def run_trench(options: argparse.Namespace) -> None:
     rules = [options.rule] if options.rule else list(rut.RULES)
     report, profiles = rut.experiment(options.spacing_mm * 1e-3, rules, scans, tell)
     if out:
-        from jaxsand.render import save_figure
-        from jaxsand.rutfigures import errors_figure, profiles_figure
+        from jaxsand.viz.render import save_figure
+        from jaxsand.viz.trenches import errors_figure, profiles_figure
 
         report["files"] = [str(file) for file in files]
         tell("drawing")
