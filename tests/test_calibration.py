@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.calibbench import bench_calibrate, bench_cone, cone
+from jaxsand.bench.calibration import bench_calibrate, bench_cone, cone
 from jaxsand.terramechanics._least_squares import Range, climb, conclude, spread
 from jaxsand.terramechanics.wheel_trench import Pass, closed_form, relaxed
 

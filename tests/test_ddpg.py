@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsand.bench.stroke_goals import usual_scene
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams, StrokeState
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.strokegoals import usual_scene
 from tests.test_probes import prober
 from train.actor import Acts
 from train.ddpg import Ddpg, begin, practise

@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from jaxsand.benchmark import table
-from jaxsand.envbench import KINDS, bench_env
+from jaxsand.bench.envs import KINDS, bench_env
+from jaxsand.bench.report import table
 
 
 def test_a_device_for_each_core_has_its_row():
     code = """
-from jaxsand.envbench import bench_env
+from jaxsand.bench.envs import bench_env
 print(*(f"{row['name']};{row['batch']};{row['steps_per_second'] > 0}" for row in bench_env(7, kinds=("walk on a map",))), sep="\\n")
 """
     done = subprocess.run(

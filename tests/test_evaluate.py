@@ -7,8 +7,8 @@ from io import BytesIO
 import numpy as np
 import pytest
 
+from jaxsand.bench.stroke_goals import letters
 from jaxsand.planning.learned.stages import Stages
-from jaxsand.strokegoals import letters
 from train.curves import curve, curves_figure, main
 from train.evaluate import evaluate, judged, picture
 from train.glyphs import SETS, read_glyphs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.expansions import heap_misdug, heap_two_colours
+from jaxsand.bench.expansions import heap_misdug, heap_two_colours
 from jaxsand.goals.letters import letter_map
 from jaxsand.planning.binary import connected_pieces, frontier
 from jaxsand.planning.binary.frontier import layered, misdug, two_colours

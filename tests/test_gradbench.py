@@ -5,10 +5,10 @@ import math
 
 import pytest
 
-from jaxsand import gradbench
 from jaxsand.__main__ import main
-from jaxsand.benchmark import table
-from jaxsand.gradcheck import Case
+from jaxsand.bench import gradients as gradbench
+from jaxsand.bench.gradient_checks import Case
+from jaxsand.bench.report import table
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
 
 SMALL = (Case(False),)

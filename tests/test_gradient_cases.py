@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.gradbench import CASES
-from jaxsand.gradcheck import Case, against_differences
+from jaxsand.bench.gradient_checks import Case, against_differences
+from jaxsand.bench.gradients import CASES
 
 SHAPE = (12, 12)
 NAMES = ("height", "stroke", "angle", "spacing", "width", "thickness", "depth", "level")

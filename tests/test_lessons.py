@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
+from jaxsand.bench.stroke_goals import CELLS, SPACING, usual_scene
 from jaxsand.goals.metrics import GLYPH_SQUARE
 from jaxsand.planning.stroke_loss import pushed
 from jaxsand.relaxation.settling import steepest_slope
-from jaxsand.strokegoals import CELLS, SPACING, usual_scene
 from train.hindsight import Hindsight, _labels, _pairs, _turned
 from train.lessons import lessons
 from train.plans import MOST, anywhere, random_plans

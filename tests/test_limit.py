@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.bench.pushes import heap, push_speed
 from jaxsand.goals.metrics import volume_error
-from jaxsand.pushbench import heap, push_speed
 
 from .conftest import ANGLE, half_turn
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from jaxsand.bench.stroke_goals import letters
 from jaxsand.planning.learned.beam_search import look_ahead, one_after_the_other, put_right
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.scene.scene import Scene, make_scene
-from jaxsand.strokegoals import letters
 
 F = letters("F")[0]  # three strokes
 SAND = SandLoss(F.scene, F.start, F.goal)

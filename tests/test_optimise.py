@@ -8,12 +8,12 @@ import pytest
 
 import jaxsand as js
 from jaxsand.__main__ import main
+from jaxsand.bench.stroke_goals import letters, many_strokes, stroke_goal
 from jaxsand.planning.gradient import as_many_as_pay, print_of, search
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import reordered
 from jaxsand.planning.gradient.sketch import guesses, printed, prints
 from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
-from jaxsand.strokegoals import letters, many_strokes, stroke_goal
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand import benchmark
-from jaxsand.plain import compile_c, settle_numpy
+from jaxsand.bench import report as benchmark
+from jaxsand.bench.rivals.plain import compile_c, settle_numpy
 
 from .conftest import ANGLE, MU
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 import jaxsand as js
-from jaxsand import complexity
+from jaxsand.bench import complexity
 from jaxsand.goals.letters import letter_map
 from jaxsand.planning.binary import connected_pieces, make_problem, relaxed
 from jaxsand.planning.binary.anytime import nearest_first, simple_bound

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsand import rutbench
 from jaxsand.__main__ import main
+from jaxsand.bench import trenches as rutbench
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.terramechanics import scans
 from jaxsand.terramechanics import trench_experiment as rut

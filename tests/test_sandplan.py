@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.bench.rivals.search import binary, greedy, shooting
+from jaxsand.bench.sand import bench_sand
 from jaxsand.planning.search.actions import Job, corners, longest_stroke, moved, propose
 from jaxsand.planning.search.binary import binary_paths, straight_runs
 from jaxsand.planning.search.reach import least_distance, most_lowered
-from jaxsand.planning.search.rivals import binary, greedy, shooting
 from jaxsand.planning.search.rollouts import Effort, distance, distinct, marks, pushed, replay, roughly_pushed, walked
 from jaxsand.planning.search.tasks import SAND_TASKS, sand_task
-from jaxsand.sandbench import bench_sand
 
 SHAPE = (14, 14)
 SCENE = js.make_scene(SHAPE, 0.01, tool=js.Blade())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand import piles
+from jaxsand.bench import piles
 
 from .conftest import ANGLE, MU
 from .test_settling import DX, rough

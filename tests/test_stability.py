@@ -3,8 +3,8 @@
 import pytest
 
 import jaxsand as js
+from jaxsand.bench.stability import stability
 from jaxsand.files import as_table
-from jaxsand.stability import stability
 
 
 def wrong(rows):
@@ -25,7 +25,7 @@ def test_the_judge_is_not_blind():
     """It sees a map that came back too steep, one that lost sand, and one that left its range."""
     from dataclasses import replace
 
-    from jaxsand import stability as suite
+    from jaxsand.bench import stability as suite
 
     case = next(c for c in suite.cases(8) if c.name == "angle 29 deg")
     for harm in (lambda h: h.at[3, 3].add(1e-3).at[9, 9].add(-1e-3), lambda h: h.at[3, 3].add(-1e-6), lambda h: h * 40):

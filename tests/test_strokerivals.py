@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand import strokebench
 from jaxsand.__main__ import main
+from jaxsand.bench import strokes as strokebench
+from jaxsand.bench.rivals.strokes import RIVALS, random_shooting
+from jaxsand.bench.stroke_goals import letters_on_rough_sand, many_strokes, stroke_goal, turned_letters
+from jaxsand.bench.strokes import reached, run_all
 from jaxsand.interaction.simulate import rollout
 from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.window import Window
-from jaxsand.strokebench import reached, run_all
-from jaxsand.strokegoals import letters_on_rough_sand, many_strokes, stroke_goal, turned_letters
-from jaxsand.strokerivals import RIVALS, random_shooting
 from jaxsand.viz.strokes import strokes_figure
 
 BOUNDS = np.array([[0.0, 0.0, 0.0, 0.0], [0.3, 0.2, 0.3, 0.2]])

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from jaxsand.bench.stroke_goals import letters
 from jaxsand.goals.layout import right, strict, strokes_right
 from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.scene.tools import Blade
-from jaxsand.strokegoals import letters
 
 DEPTH = float(Blade().depth)
 E = letters("E")[0]  # four strokes

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.stroke_goals import CELLS
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.scene.scene import Scene, blade_of
-from jaxsand.strokegoals import CELLS
 from train.nets import Actor, Critic
 
 _TRIED = 16  # actions for each one that is asked for

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxsand.bench.stroke_goals import StrokeGoal
 from jaxsand.goals import metrics as task
 from jaxsand.goals.layout import right, strict, strokes_right
 from jaxsand.planning.learned.beam_search import Proposes
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
-from jaxsand.strokegoals import StrokeGoal
 from jaxsand.viz.strokes import found_figure
 
 if TYPE_CHECKING:

@@ -9,11 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxsand.bench.stroke_goals import (
+    CELLS,
+    SPACING,
+    StrokeGoal,
+    letters,
+    letters_on_rough_sand,
+    stroke_goal,
+    turned_letters,
+)
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.strokegoals import CELLS, SPACING, StrokeGoal, letters, letters_on_rough_sand, stroke_goal, turned_letters
 from train.plans import random_plans
 
 _SEED = 2_000_003

@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxsand.bench.stroke_goals import CELLS, SPACING, usual_scene
 from jaxsand.goals.layout import right, strokes_right
 from jaxsand.goals.metrics import iou
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.learned.network import StrokeNet, ends, judge, likeliest, spread
 from jaxsand.planning.learned.policy import Policy, in_batches
 from jaxsand.scene.scene import Scene, blade_of
-from jaxsand.strokegoals import CELLS, SPACING, usual_scene
 from train.lessons import Lessons, lessons, way
 from train.plans import MOST, random_plans
 from train.sand import other_scene, starts

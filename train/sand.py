@@ -5,10 +5,10 @@ import math
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from jaxsand.bench.stroke_goals import CELLS, SPACING
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.strokegoals import CELLS, SPACING
 
 _RELIEF = 0.015  # m, at most
 _FEATURES = (1.0, 6.0)  # cells

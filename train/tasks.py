@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.stroke_goals import usual_scene
 from jaxsand.envs.library import RandomStrokes
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.goals import metrics as task
@@ -15,7 +16,6 @@ from jaxsand.goals.layout import right
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.stroke_loss import pushed
 from jaxsand.scene.tools import Blade
-from jaxsand.strokegoals import usual_scene
 from train.actor import Acts
 from train.probes import Probe
 

@@ -13,7 +13,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
     out = folder(options.out) if options.out else None
     if options.what == "env":
         _device_for_each_core()
-    from jaxsand.benchmark import bench, table
+    from jaxsand.bench.report import bench, table
 
     strokes = _of_strokes(options)
     report = bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
@@ -34,7 +34,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
             with written(out / "bench-trench.png") as path:
                 save_figure(spacing_figure(report["trench_by_spacing"]), path)
         if "strokes_curves" in report:
-            from jaxsand.strokebench import REACHED, found
+            from jaxsand.bench.strokes import REACHED, found
             from jaxsand.viz.strokes import found_figure, strokes_figure
 
             with written(out / "bench-strokes.png") as path:

@@ -8,8 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsand.bench.rivals import search as rivals
 from jaxsand.interaction.simulate import step
-from jaxsand.planning.search import plan_sand, rivals
+from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Job, Lattice, Steps, propose
 from jaxsand.planning.search.rollouts import distance, pushed, replay, roughly_pushed
 from jaxsand.planning.search.tasks import SAND_TASKS, SandTask, sand_task

@@ -18,25 +18,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand import (
-    analysis,
-    calibbench,
-    complexity,
-    envbench,
-    expansions,
-    gradbench,
-    piles,
-    pushbench,
-    rutbench,
-    sandbench,
-    stability,
-    strokebench,
-    workprec,
-)
+from jaxsand.bench import analysis, complexity, expansions, piles, stability
+from jaxsand.bench import calibration as calibbench
+from jaxsand.bench import envs as envbench
+from jaxsand.bench import gradients as gradbench
+from jaxsand.bench import pushes as pushbench
+from jaxsand.bench import sand as sandbench
+from jaxsand.bench import strokes as strokebench
+from jaxsand.bench import trenches as rutbench
+from jaxsand.bench import work_precision as workprec
+from jaxsand.bench.letters import bench_letters
+from jaxsand.bench.rivals.plain import compile_c, settle_numpy
 from jaxsand.files import as_table
 from jaxsand.interaction.simulate import act
-from jaxsand.letterbench import bench_letters
-from jaxsand.plain import compile_c, settle_numpy
 from jaxsand.relaxation._batching import cores
 from jaxsand.relaxation.schemes import Relaxation, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch

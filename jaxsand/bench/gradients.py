@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.gradcheck import (
+from jaxsand.bench.gradient_checks import (
     SPACING,
     Case,
     Inputs,

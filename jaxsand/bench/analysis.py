@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.plain import settle_numpy
+from jaxsand.bench.rivals.plain import settle_numpy
+from jaxsand.bench.work_precision import COLUMN, RIDGE, distance, trench
 from jaxsand.relaxation._ghost_cells import at, halo, largest, prepare, quantum
 from jaxsand.relaxation.flux import Nothing
 from jaxsand.relaxation.schemes import Relaxation
@@ -21,7 +22,6 @@ from jaxsand.relaxation.settling import relax, settle, settle_batch
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.relaxation.sweep import Flow, sweep
 from jaxsand.scene.scene import Scene, make_scene
-from jaxsand.workprec import COLUMN, RIDGE, distance, trench
 
 Tell = Callable[[str], None]
 _ANGLE = math.radians(29)

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.work_precision import MU, roof
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.boundaries import Draining
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import make_scene
-from jaxsand.workprec import MU, roof
 
 Tell = Callable[[str], None]
 ANGLE = math.radians(29)

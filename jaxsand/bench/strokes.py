@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.rivals.strokes import RIVALS, Found
+from jaxsand.bench.stroke_goals import GOALS, StrokeGoal
 from jaxsand.planning.gradient import first, print_of, search
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import reordered
 from jaxsand.planning.stroke_loss import Best, SandLoss
-from jaxsand.strokegoals import GOALS, StrokeGoal
-from jaxsand.strokerivals import RIVALS, Found
 
 Tell = Callable[[str], None]
 Row = dict[str, Any]

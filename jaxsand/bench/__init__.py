@@ -1,0 +1,1 @@
+"""Error against run time, robustness and rivals: what `jaxsand bench` runs."""

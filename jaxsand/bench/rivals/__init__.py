@@ -1,0 +1,1 @@
+"""What jaxsand is measured against."""
