@@ -288,7 +288,7 @@ def test_help_does_not_import_jax():
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
-    from jaxsand.files import written
+    from jaxsand.cli.files import written
 
     target = tmp_path / "result.json"
     target.write_text("old")

@@ -5,7 +5,7 @@ import math
 import sys
 from typing import Any
 
-from jaxsand.commands.arguments import Parser, count, ended, keep_compiled_programs, path_name, seed, width
+from jaxsand.cli.arguments import Parser, count, ended, keep_compiled_programs, path_name, seed, width
 from train.commands import MINUTES, SHIPPED, run_evaluation, run_shipping, run_training
 
 _STEPS = {

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import jaxsand
-from jaxsand.commands.printing import lines, show
-from jaxsand.files import as_table, existing, folder, progress, write_json, written
+from jaxsand.bench.tables import as_table
+from jaxsand.cli.files import existing, folder, progress, write_json, written
+from jaxsand.cli.printing import lines, show
 
 MINUTES = {"hindsight": 30.0, "dqn": 10.0, "ddpg": 10.0}
 """How long each learner trains unless it is told."""

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxsand.commands.arguments import Parser, ended, path_name
-from jaxsand.files import existing, written
+from jaxsand.cli.arguments import Parser, ended, path_name
+from jaxsand.cli.files import existing, written
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from matplotlib.path import Path as Outline
 
-from jaxsand.commands.arguments import Parser, count, ended, seed
-from jaxsand.files import as_json, as_table, progress
+from jaxsand.bench.tables import as_table
+from jaxsand.cli.arguments import Parser, count, ended, seed
+from jaxsand.cli.files import as_json, progress
 from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Stages, plan_by_policy

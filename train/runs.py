@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, BinaryIO, Literal, Protocol
 
-from jaxsand.files import as_json, folder, progress, write_json
+from jaxsand.cli.files import as_json, folder, progress, write_json
 from train.checkpoints import At, State, described, restored, save, unwritable, where
 from train.checkpoints import load as load_state
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.commands.arguments import Parser, count, ended
-from jaxsand.commands.arguments import seed as a_seed
+from jaxsand.cli.arguments import Parser, count, ended
+from jaxsand.cli.arguments import seed as a_seed
 
 _LIMIT = 3  # strokes to an episode
 _JUDGED = 16  # episodes that the mean reward is taken over

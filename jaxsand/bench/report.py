@@ -29,7 +29,7 @@ from jaxsand.bench import trenches as rutbench
 from jaxsand.bench import work_precision as workprec
 from jaxsand.bench.letters import bench_letters
 from jaxsand.bench.rivals.plain import compile_c, settle_numpy
-from jaxsand.files import as_table
+from jaxsand.bench.tables import as_table
 from jaxsand.interaction.simulate import act
 from jaxsand.relaxation._batching import cores
 from jaxsand.relaxation.schemes import Relaxation, SuperTimeStepping

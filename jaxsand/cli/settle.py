@@ -5,8 +5,8 @@ import math
 import sys
 import time
 
-from jaxsand.commands.printing import lines, show
-from jaxsand.files import existing, folder, progress, written
+from jaxsand.cli.files import existing, folder, progress, written
+from jaxsand.cli.printing import lines, show
 
 SCHEMES = ("relaxation", "pairwise", "super-time-stepping", "multilevel")
 

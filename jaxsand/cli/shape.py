@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxsand.commands.printing import plain_name, read_cell, show
-from jaxsand.files import existing, folder, progress, read_text, write_json, written
+from jaxsand.cli.files import existing, folder, progress, read_text, write_json, written
+from jaxsand.cli.printing import plain_name, read_cell, show
 
 if TYPE_CHECKING:
     import numpy as np

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxsand.files import as_json
+from jaxsand.cli.files import as_json
 
 
 def read_cell(text: str | None, field: str = "start") -> tuple[int, int] | None:

@@ -4,8 +4,8 @@ import argparse
 from contextlib import suppress
 from typing import Any
 
-from jaxsand.commands.printing import show
-from jaxsand.files import folder, progress, write_json, written
+from jaxsand.cli.files import folder, progress, write_json, written
+from jaxsand.cli.printing import show
 
 
 def run_benchmark(options: argparse.Namespace) -> None:

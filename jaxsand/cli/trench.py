@@ -5,8 +5,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from jaxsand.commands.printing import show
-from jaxsand.files import as_json, as_table, folder, progress, written
+from jaxsand.bench.tables import as_table
+from jaxsand.cli.files import as_json, folder, progress, written
+from jaxsand.cli.printing import show
 
 _FILES = ("profiles.csv", "trench.png", "trench-errors.png", "trench.json")
 

@@ -4,8 +4,8 @@ import argparse
 import time
 from pathlib import Path
 
-from jaxsand.commands.printing import lines, plain_name, read_cell, show
-from jaxsand.files import folder, progress, read_text, write_json, written
+from jaxsand.cli.files import folder, progress, read_text, write_json, written
+from jaxsand.cli.printing import lines, plain_name, read_cell, show
 
 
 def run_plan(options: argparse.Namespace) -> None:
