@@ -1,4 +1,4 @@
-"""Derivatives by hand (advance.py, around.py) against central differences, on the ways where they differ."""
+"""Derivatives by hand (_advance.py, _contact_sweeps.py) against central differences, on the ways where they differ."""
 
 import jax
 import jax.numpy as jnp

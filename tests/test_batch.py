@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.relaxation import _batching as batch
+from jaxsand.relaxation import batching as batch
 
 from .conftest import ANGLE
 

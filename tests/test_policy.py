@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsand.planning.learned._square_symmetries import turned, turned_back, turned_strokes, turned_strokes_back
 from jaxsand.planning.learned.network import (
     Lines,
     Scores,
@@ -20,6 +19,7 @@ from jaxsand.planning.learned.network import (
     symmetric,
 )
 from jaxsand.planning.learned.policy import Policy, load_policy, save_policy
+from jaxsand.planning.learned.square_symmetries import turned, turned_back, turned_strokes, turned_strokes_back
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
 

@@ -144,8 +144,8 @@ def test_pairwise_is_quick_and_unfaithful_but_approaches_the_limit_with_its_shar
 @pytest.mark.parametrize(("neighbours", "wave"), [(4, "board"), (8, "stripes"), ("isotropic", "board")])
 def test_stable_ranges_within_two_per_cent(neighbours, wave):
     """The fastest-growing mode, on sand that yields everywhere, shrinks just inside the range and grows just outside."""
-    from jaxsand.relaxation._ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.flux import Nothing, fluxes_zero
+    from jaxsand.relaxation.ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.schemes import stable_rate
     from jaxsand.relaxation.sweep import Flow, surge, sweep
 

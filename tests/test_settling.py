@@ -199,8 +199,8 @@ def test_outcome_names_a_bound_that_is_too_small():
 @pytest.mark.parametrize(("neighbours", "limit"), [(4, 1 / 4), (8, 1 / (2 + 2 * math.sqrt(2)))])
 def test_the_stable_range_is_where_the_checkerboard_stops_shrinking(neighbours, limit):
     """Just inside the range a steep checkerboard calms down; just outside it is refused, and would grow."""
-    from jaxsand.relaxation._ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.flux import Nothing
+    from jaxsand.relaxation.ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.settling import relax
     from jaxsand.relaxation.sweep import Flow, sweep
 

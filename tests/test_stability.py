@@ -4,7 +4,7 @@ import pytest
 
 import jaxsand as js
 from jaxsand.bench.stability import stability
-from jaxsand.cli.files import as_table
+from jaxsand.bench.tables import as_table
 
 
 def wrong(rows):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.envs.maps import STEPS
-from jaxsand.planning.learned._square_symmetries import turned_back as turned
+from jaxsand.planning.learned.square_symmetries import turned_back as turned
 from train.qnet import Greedy
 
 VIEWS = range(8)

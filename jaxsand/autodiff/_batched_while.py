@@ -1,4 +1,4 @@
-"""Loops of a batch of maps in lockstep, each until it is done: how loop.py runs under `vmap`.
+"""Loops of a batch of maps in lockstep, each until it is done: how while_loop.py runs under `vmap`.
 
 The step's number is one number, not one for each map, and the tape that reverse mode reads is written in place.
 

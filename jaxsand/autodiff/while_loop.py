@@ -134,7 +134,7 @@ def hidden(tree: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:
     """The bits of a tree's floats as whole numbers, and how to get them back, which costs nothing within a program.
 
     What a derivative keeps leaves the program that computes it, and `jax_debug_nans` would take the NaN of cells without
-    sand (bed.py) for a fault.
+    sand (ghost_cells.py) for a fault.
     """
     types = jax.tree.map(jnp.result_type, tree)
 

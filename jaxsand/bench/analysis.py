@@ -15,8 +15,8 @@ import numpy as np
 
 from jaxsand.bench.rivals.plain import settle_numpy
 from jaxsand.bench.work_precision import COLUMN, RIDGE, distance, trench
-from jaxsand.relaxation._ghost_cells import at, halo, largest, prepare, quantum
 from jaxsand.relaxation.flux import Nothing
+from jaxsand.relaxation.ghost_cells import at, halo, largest, prepare, quantum
 from jaxsand.relaxation.schemes import Relaxation
 from jaxsand.relaxation.settling import relax, settle, settle_batch
 from jaxsand.relaxation.stopping import UntilStill

@@ -14,8 +14,8 @@ from jaxsand.relaxation.settling import settle
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-from jaxsand.terramechanics._finer import OneGrid, TwoGrids
 from jaxsand.terramechanics.calibration import Trial, calibrate
+from jaxsand.terramechanics.finer import OneGrid, TwoGrids
 
 NOISE = 6e-4
 """Standard deviation (m) of the white noise in the heights after."""

@@ -19,7 +19,7 @@ from jax.sharding import PartitionSpec as P
 from jaxsand.envs import LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.planning.stroke_loss import pushed
-from jaxsand.relaxation._batching import wide_vectors
+from jaxsand.relaxation.batching import wide_vectors
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.window import Whole
 

@@ -136,7 +136,7 @@ def _sweeps(case: Case, cells: int, strokes: np.ndarray, settling: int) -> tuple
 
 def accuracy(tell: Tell, cases: tuple[Case, ...], points: int, cells: int) -> list[Row]:
     """Errors over the gradient's norm: of float64 by each input against central differences where the points are smooth (see
-    gradcheck.py), of which `smooth` is the share, and of float32 against float64."""
+    gradient_checks.py), of which `smooth` is the share, and of float32 against float64."""
     rows = []
     for case in cases:
         tell(f"error: {case.name}")

@@ -19,14 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.interaction._resting import Sand, no_flux
-from jaxsand.interaction._stencil import net, steps
 from jaxsand.interaction.batched import step_batch, value_and_grad_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.blade_stepped import SteppedPush, push_along, with_near
+from jaxsand.interaction.resting import Sand, no_flux
 from jaxsand.interaction.simulate import follow_frames, step
-from jaxsand.relaxation._ghost_cells import truncate
+from jaxsand.interaction.stencil import net, steps
 from jaxsand.relaxation.flux import Fluxes
+from jaxsand.relaxation.ghost_cells import truncate
 from jaxsand.relaxation.settling import settle, settle_batch
 from jaxsand.scene.grid import links
 from jaxsand.scene.scene import Scene, cast, fit, make_scene

@@ -31,7 +31,7 @@ from jaxsand.bench.letters import bench_letters
 from jaxsand.bench.rivals.plain import compile_c, settle_numpy
 from jaxsand.bench.tables import as_table
 from jaxsand.interaction.simulate import act
-from jaxsand.relaxation._batching import cores
+from jaxsand.relaxation.batching import cores
 from jaxsand.relaxation.schemes import Relaxation, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch
 from jaxsand.relaxation.stopping import Sweeps, UntilStill

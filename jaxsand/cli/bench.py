@@ -52,7 +52,7 @@ def _device_for_each_core() -> None:
     """As the README has it for batches of environments; too late once JAX has begun to compute."""
     import jax
 
-    from jaxsand.relaxation._batching import processors
+    from jaxsand.relaxation.batching import processors
 
     with suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", processors())

@@ -109,7 +109,7 @@ def by_length(way: ByLength, alone: Pushing) -> Pushing:
             more, to_before = backwards(*primals, gain)
             return ravel_pytree((jax.tree.map(jnp.add, to_floats, more), to_before))[0]
 
-        # As in loop.py: the solution of "identity times x = start" by rules of our own.
+        # As in while_loop.py: the solution of "identity times x = start" by rules of our own.
         dheight = unravel(lax.custom_linear_solve(lambda v: v, start, solve, transpose))[1]
         after, outcome = many(*primals)
         return (after, outcome), (dheight, np.zeros(outcome.shape, jax.dtypes.float0))

@@ -1,4 +1,4 @@
-"""A blade moves ahead, by sub-steps; a step of a loop (loop.py) is several of them, within a spacing.
+"""A blade moves ahead, by sub-steps; a step of a loop (while_loop.py) is several of them, within a spacing.
 
 The sub-steps ahead are pulled back in their block alone: from the block before a step its sub-steps are made again, and
 each is differentiated by JAX but for the sand's coming to rest, whose derivative resting.py writes out.
@@ -17,11 +17,11 @@ from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way, pose_ahead
 from jaxsand.interaction._frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
-from jaxsand.interaction._resting import Links, Sand, bring_to_rest
 from jaxsand.interaction._resting_adjoint import Rested, blank, rest_pulled, rest_taped
-from jaxsand.interaction._stencil import inner, spread
-from jaxsand.relaxation._ghost_cells import at, halo
+from jaxsand.interaction.resting import Links, Sand, bring_to_rest
+from jaxsand.interaction.stencil import inner, spread
 from jaxsand.relaxation.flux import Fluxes
+from jaxsand.relaxation.ghost_cells import at, halo
 
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 
@@ -47,7 +47,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of a loop that computes a batch in the last axis; see loop.py."""
+    """A step of a loop that computes a batch in the last axis; see while_loop.py."""
 
     block: Block
     tape: int = 32

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.interaction._displacement import EIGHT, shares
-from jaxsand.interaction._stencil import both_ends, inner, outer, seen
-from jaxsand.relaxation._ghost_cells import at, truncate
+from jaxsand.interaction.stencil import both_ends, inner, outer, seen
 from jaxsand.relaxation.flux import Fluxes
+from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.grid import Neighbours
 
 _LEAST = 1e-4

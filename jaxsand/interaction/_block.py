@@ -9,10 +9,10 @@ from jax import lax
 
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._frame import Frame, Places, cut, numbers, paste, places
-from jaxsand.interaction._resting import Sand, where_open
-from jaxsand.interaction._stencil import both_ends, inner, put, spread, window
-from jaxsand.relaxation._ghost_cells import Lost, at, halo, lose, nearest
+from jaxsand.interaction.resting import Sand, where_open
+from jaxsand.interaction.stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation.flux import Fluxes
+from jaxsand.relaxation.ghost_cells import Lost, at, halo, lose, nearest
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.tools import Pose
 

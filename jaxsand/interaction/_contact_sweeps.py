@@ -1,7 +1,7 @@
 """Sweeps around a tool that stands in the sand, and their derivative: what a sub-step of a push keeps and pulls back.
 
 For the surface s of each sweep, D its steps over the links, e the excess of those over repose, g how open a link is and l
-its length, a sweep moves h by G (rate g e / l); see adjoint.py. With y = D lambda, summed over the sweeps,
+its length, a sweep moves h by G (rate g e / l); see flux_adjoint.py. With y = D lambda, summed over the sweeps,
 
     E = sum of e y        gives  -rate E / l  for g  and  -sum of g E / l  for the rate,
     M = sum of sigma g y  gives  rate M       for the largest stable step of a straight link.
@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, repeat, split
-from jaxsand.relaxation import _flux_adjoint as adjoint
-from jaxsand.relaxation._ghost_cells import Bed, Lost, at, halo
+from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Around, flows
+from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 

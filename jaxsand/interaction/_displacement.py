@@ -1,9 +1,9 @@
 """Where sand goes that a tool displaces.
 
 Whenever the share of a cell that the tool covers grows from a to b, the share (b - a) / (1 - a) of its sand above the
-tool's bottom has to leave. It goes to neighbouring cells, to the one or two of the eight that lie in its direction, shared
-as the direction divides the angle between them. Every amount is a whole number of quanta (see bed.py), so that volume is
-kept as well as floats allow.
+tool's bottom has to leave. It goes to neighbouring cells, to the one or two of the eight that lie in its direction,
+shared as the direction divides the angle between them. Every amount is a whole number of quanta (see ghost_cells.py), so
+that volume is kept as well as floats allow.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from jaxsand.autodiff.while_loop import repeat
 from jaxsand.interaction._contact_sweeps import Beside
-from jaxsand.relaxation._ghost_cells import Bed, Lost, truncate
 from jaxsand.relaxation.flux import stand
+from jaxsand.relaxation.ghost_cells import Bed, Lost, truncate
 from jaxsand.relaxation.sweep import Flow
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)

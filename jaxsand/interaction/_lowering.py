@@ -11,8 +11,8 @@ from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._advance import Step
 from jaxsand.interaction._block import Moving, Way
 from jaxsand.interaction._frame import frame_of
-from jaxsand.interaction._stencil import inner
-from jaxsand.relaxation._ghost_cells import at, truncate
+from jaxsand.interaction.stencil import inner
+from jaxsand.relaxation.ghost_cells import at, truncate
 
 
 @dataclass(frozen=True)

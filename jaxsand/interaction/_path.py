@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.interaction._displacement import Job
-from jaxsand.relaxation._ghost_cells import (
+from jaxsand.relaxation.flux import worst_excess
+from jaxsand.relaxation.ghost_cells import (
     Lost,
     halo,
     largest,
@@ -22,7 +23,6 @@ from jaxsand.relaxation._ghost_cells import (
     unmark,
     volume_lost,
 )
-from jaxsand.relaxation.flux import worst_excess
 from jaxsand.relaxation.stopping import Outcome, said
 from jaxsand.relaxation.sweep import Flow
 from jaxsand.scene.grid import centres

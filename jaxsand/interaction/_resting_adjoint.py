@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.interaction._resting import Links
-from jaxsand.interaction._stencil import inner, net, outer, rises, steps, total
+from jaxsand.interaction.resting import Links
+from jaxsand.interaction.stencil import inner, net, outer, rises, steps, total
 from jaxsand.relaxation.flux import Fluxes
 
 

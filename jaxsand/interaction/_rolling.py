@@ -1,4 +1,5 @@
-"""The steps of a wheel's leg: it is lowered, it turns in place, and it moves ahead. Each is a step of a loop (loop.py)."""
+"""The steps of a wheel's leg: it is lowered, it turns in place, and it moves ahead. Each is a step of a loop
+(while_loop.py)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,11 +14,11 @@ from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import Step
 from jaxsand.interaction._block import First, Moving, View, pose_ahead
 from jaxsand.interaction._frame import Frame, frame_of, shifted
-from jaxsand.interaction._resting import bring_to_rest, where_open
 from jaxsand.interaction._turning import rotated
 from jaxsand.interaction._wheel import Stand, Track
-from jaxsand.relaxation._ghost_cells import at, truncate
+from jaxsand.interaction.resting import bring_to_rest, where_open
 from jaxsand.relaxation.flux import Fluxes
+from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.tools import Pose
 
 Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)

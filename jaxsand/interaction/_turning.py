@@ -11,9 +11,9 @@ from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._advance import Rest, Step
 from jaxsand.interaction._block import Moving, Way
 from jaxsand.interaction._frame import Frame
-from jaxsand.interaction._resting import bring_to_rest
-from jaxsand.interaction._stencil import inner
-from jaxsand.relaxation._ghost_cells import at
+from jaxsand.interaction.resting import bring_to_rest
+from jaxsand.interaction.stencil import inner
+from jaxsand.relaxation.ghost_cells import at
 from jaxsand.scene.tools import Pose
 
 

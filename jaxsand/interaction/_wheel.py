@@ -1,6 +1,6 @@
 """What a wheel does to the sand in a block around it: it clears what it newly covers, and parts what it stands between.
 
-A wheel is a rim over each cell, at a height b of its own (tool.py), with room below where it hangs above the sand. Where it
+A wheel is a rim over each cell, at a height b of its own (tools.py), with room below where it hangs above the sand. Where it
 covers the share a of a cell, the cell's sand above b lies in the open share 1 - a. What comes to lie above the rim as the
 wheel moves leaves it along the normal of the face that displaces it, the rim or the flank that leads; off the rim also
 towards the nearer flank. Sand under the wheel is handed on, cell by cell, until there is room beside it or below the rim.
@@ -20,10 +20,10 @@ from jax import lax
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._block import Block, First, View, Way
 from jaxsand.interaction._frame import Frame
-from jaxsand.interaction._resting import Sand
-from jaxsand.interaction._stencil import both_ends, inner, outer, seen, spread
-from jaxsand.relaxation._ghost_cells import at, truncate
+from jaxsand.interaction.resting import Sand
+from jaxsand.interaction.stencil import both_ends, inner, outer, seen, spread
 from jaxsand.relaxation.flux import NARROW, Fluxes
+from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.grid import Neighbours
 
 _TOUCH = 0.25  # of a spacing below the rim, sand does not feel it

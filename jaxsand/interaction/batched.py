@@ -17,7 +17,7 @@ import numpy as np
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.blade_stepped import windows_for
 from jaxsand.interaction.simulate import Push, Rules, Shaped, lifted, ready, step, way_of
-from jaxsand.relaxation._batching import in_groups, in_turns, wide_vectors
+from jaxsand.relaxation.batching import in_groups, in_turns, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
 from jaxsand.relaxation.stopping import Outcome, Stop, as_batch, check_chunk

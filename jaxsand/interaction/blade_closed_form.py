@@ -1,6 +1,6 @@
 """A push in one go: what the blade's swath takes up is set down as berms, as a heap ahead, and behind the start.
 
-The blade pushes a heap of height H before it (mound.py). What sticks out of the heap's two flanks is left behind as berms,
+The blade pushes a heap of height H before it (_mound.py). What sticks out of the heap's two flanks is left behind as berms,
 triangles at repose of cross section H^2 / (2 mu) each, mu = tan(angle of repose). A blade of width w that cuts d deep is in
 balance when they take what it cuts, w d:
 
@@ -11,11 +11,11 @@ heap of volume V leaves V / l to a unit of length, so that along the stroke, wit
 
     dV/ds = q(s) - a V / l,   l = w / 2 + (pi / 6) a r,
 
-a the share of the two flanks where a berm finds room. Beside walls or a closed edge a = 0: the heap keeps all, as the right
-triangle of peak sqrt(2 mu V / w) over its channel. By symmetry half a blade beside a wall is a blade twice as wide.
-Over a draining edge what stands beyond it or above its rim runs off (overflow.py). A heap without room goes back to where it
-was taken from. Every amount is a whole number of quanta and what the cuts leave over goes to one cell, so that volume is
-kept as well as floats allow.
+a the share of the two flanks where a berm finds room. Beside walls or a closed edge a = 0: the heap keeps all, as the
+right triangle of peak sqrt(2 mu V / w) over its channel. By symmetry half a blade beside a wall is a blade twice as
+wide. Over a draining edge what stands beyond it or above its rim runs off (_overflow.py). A heap without room goes back
+to where it was taken from. Every amount is a whole number of quanta and what the cuts leave over goes to one cell, so
+that volume is kept as well as floats allow.
 """
 
 import math
@@ -34,7 +34,7 @@ from jaxsand.interaction._overflow import Rim, nothing_beyond
 from jaxsand.interaction._path import Pushed, State, along_legs, corners, over_the_map
 from jaxsand.interaction._shade import on_line, within_reach
 from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
-from jaxsand.relaxation._ghost_cells import Lost, lose
+from jaxsand.relaxation.ghost_cells import Lost, lose
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, coverage, local

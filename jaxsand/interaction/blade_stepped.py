@@ -1,7 +1,7 @@
 """What a blade does to the sand: it is lowered, turned and moved, and the sand around it is kept at rest.
 
 The quasi-static limit is that of a tool so slow that the sand is always at rest. The blade advances by sub-steps of a fixed
-part of a spacing; after each, what it newly covers has left along its face's normal (blade.py) and the sand is brought to
+part of a spacing; after each, what it newly covers has left along its face's normal (_blade.py) and the sand is brought to
 rest around it (resting.py). When it is lowered, what it covers leaves radially: away from its centre in the blade's own
 proportions, along the gradient of (s / thickness)^2 + (n / width)^2 with s along and n across the blade. At a corner it
 turns in place, by the smaller angle, in sub-steps of an angle; what it sweeps leaves along its faces. A reversal is half a
@@ -27,8 +27,8 @@ from jaxsand.interaction._block import SPARE, Block, Moving, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._lowering import Lower
 from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
-from jaxsand.interaction._resting import bring_to_rest, no_flux
 from jaxsand.interaction._turning import Turn
+from jaxsand.interaction.resting import bring_to_rest, no_flux
 from jaxsand.scene.scene import Scene, concrete
 from jaxsand.scene.tools import Blade, Pose
 from jaxsand.scene.window import AsNeeded, Window

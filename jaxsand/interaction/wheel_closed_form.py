@@ -1,13 +1,13 @@
 """A wheel's pass in one go: its cut, and the sand of the cut in a pile on each side.
 
-The closed form's step before the sand flows (trench.py), as a push: in the way's frame the wheel cuts down to the lowest its
-rim comes to, here a parabola as deep as the sinkage h and as wide as the chord 2 s, and what was above stands beside the
-cut's edges at w / 2, w = b cos(beta) + 2 s sin(beta), in right triangles at repose of the height sqrt(2 t A), t = tan(angle
-of repose) and A the area that their side gets of each section. Sections exchange nothing.
+The closed form's step before the sand flows (wheel_trench.py), as a push: in the way's frame the wheel cuts down to the
+lowest its rim comes to, here a parabola as deep as the sinkage h and as wide as the chord 2 s, and what was above stands
+beside the cut's edges at w / 2, w = b cos(beta) + 2 s sin(beta), in right triangles at repose of the height sqrt(2 t A),
+t = tan(angle of repose) and A the area that their side gets of each section. Sections exchange nothing.
 
 Grousers leave their part in the cut, level, and the pile that the rim pushes has less.
 
-Source: Pavlov & Johnson, ICRA 2019, restated in trench.py.
+Source: Pavlov & Johnson, ICRA 2019, restated in wheel_trench.py.
 """
 
 import math

@@ -1,10 +1,10 @@
 """What a wheel does to the sand: it is lowered, turned and moved at its sinkage, and the sand around it is kept at rest.
 
-As for a blade (push.py): the wheel advances by sub-steps of a fixed part of a spacing; after each, what it newly covers has
-left it (wheel.py) and the sand is brought to rest around it (resting.py). When it is lowered, what it covers leaves
-radially, in the proportions of its chord and width. At a corner it turns in place, by the smaller angle, in sub-steps of an
-angle; what it sweeps leaves along its axle. Sand under the wheel is handed on by up to four cells in a sub-step; what is on
-its way, one or two percent of all that is displaced, waits under the wheel.
+As for a blade (blade_stepped.py): the wheel advances by sub-steps of a fixed part of a spacing; after each, what it
+newly covers has left it (_wheel.py) and the sand is brought to rest around it (resting.py). When it is lowered, what it
+covers leaves radially, in the proportions of its chord and width. At a corner it turns in place, by the smaller angle,
+in sub-steps of an angle; what it sweeps leaves along its axle. Sand under the wheel is handed on by up to four cells in
+a sub-step; what is on its way, one or two percent of all that is displaced, waits under the wheel.
 
 Derivatives by the height, the sinkage and, at oblique angles, the width are of use; those by the stroke's place and the slip
 angle, and by the width of a wheel that runs along its plane, are those of a map that is rough on the scale of a cell's share
@@ -26,10 +26,10 @@ from jaxsand.autodiff.while_loop import repeat, repeat_until
 from jaxsand.interaction._block import Block, Moving, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
-from jaxsand.interaction._resting import no_flux
 from jaxsand.interaction._rolling import Roll, Touchdown, Turn
 from jaxsand.interaction._wheel import Track
 from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.resting import no_flux
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, Smooth, carried_area, half_chord
 from jaxsand.scene.window import Window

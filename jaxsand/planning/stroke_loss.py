@@ -1,6 +1,6 @@
 """How far plans of strokes end from a goal: many at once, through the simulator, and counted.
 
-They are pushed by pusher.py.
+They are pushed by batched.py.
 """
 
 from collections.abc import Callable

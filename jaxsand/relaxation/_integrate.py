@@ -11,9 +11,9 @@ import numpy as np
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
-from jaxsand.relaxation._ghost_cells import Bed, Lost, grain, truncate
 from jaxsand.relaxation._rkl import Surges
 from jaxsand.relaxation.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.relaxation.ghost_cells import Bed, Lost, grain, truncate
 from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.relaxation.sweep import Flow, Sweep, apply
 from jaxsand.scene.grid import links

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.relaxation._ghost_cells import Bed, at, grain, halo, nothing_lost, rim_of, truncate
 from jaxsand.relaxation._integrate import Sand, march, still
 from jaxsand.relaxation.flux import Nothing, Partial
+from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo, nothing_lost, rim_of, truncate
 from jaxsand.relaxation.schemes import Multilevel, schedule
 
 Cells = Nothing | Partial

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, repeat, split
-from jaxsand.relaxation import _flux_adjoint as adjoint
-from jaxsand.relaxation._ghost_cells import Bed, at, grain, halo
+from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Nothing, Partial
+from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo
 from jaxsand.relaxation.schemes import Schedule
 from jaxsand.relaxation.sweep import Flow, surge
 
@@ -19,8 +19,8 @@ from jaxsand.relaxation.sweep import Flow, surge
 class Surges:
     """Group k of `interval` sweeps of a schedule; `params` are the bed, the cells and limits that it does not use.
 
-    Where sand flows in pairs over no rim it leaves two bits for each link and sweep on the tape, from which adjoint.py tells
-    the derivative; elsewhere the state before the group, fluxes included.
+    Where sand flows in pairs over no rim it leaves two bits for each link and sweep on the tape, from which
+    flux_adjoint.py tells the derivative; elsewhere the state before the group, fluxes included.
     """
 
     plan: Schedule

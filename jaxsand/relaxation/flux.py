@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.relaxation._ghost_cells import Bed, Rim, at, halo
+from jaxsand.relaxation.ghost_cells import Bed, Rim, at, halo
 from jaxsand.scene.grid import Link, Neighbours, links
 
 Fluxes = tuple[jax.Array, ...]

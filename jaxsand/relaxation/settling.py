@@ -8,8 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.relaxation._batching import march_batch, on_all_cores, wide_vectors
-from jaxsand.relaxation._ghost_cells import (
+from jaxsand.relaxation._integrate import March, Sand, march
+from jaxsand.relaxation._multigrid import descend, start
+from jaxsand.relaxation.batching import march_batch, on_all_cores, wide_vectors
+from jaxsand.relaxation.flux import Nothing, middle, steepest, worst_excess
+from jaxsand.relaxation.ghost_cells import (
     Bed,
     Lost,
     at,
@@ -23,9 +26,6 @@ from jaxsand.relaxation._ghost_cells import (
     unmark,
     volume_lost,
 )
-from jaxsand.relaxation._integrate import March, Sand, march
-from jaxsand.relaxation._multigrid import descend, start
-from jaxsand.relaxation.flux import Nothing, middle, steepest, worst_excess
 from jaxsand.relaxation.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
 from jaxsand.relaxation.stopping import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
 from jaxsand.scene.scene import Scene, cast, fit
@@ -57,9 +57,9 @@ def settle(
 ) -> Settled:
     """Lets a map [H, W] (m) settle to its angle of repose. One map; batch with `jax.vmap` or `settle_batch`.
 
-    Conserves volume up to what bed.py says of rounding, leaves a settled map as it is to the last bit, and commutes with
-    h -> -h, with mirrors and quarter turns (to rounding for isotropic sand and on coarse grids; not `Pairwise`) and, up to
-    the floats' spacing, with adding a constant. What else holds is said of each scheme.
+    Conserves volume up to what ghost_cells.py says of rounding, leaves a settled map as it is to the last bit, and
+    commutes with h -> -h, with mirrors and quarter turns (to rounding for isotropic sand and on coarse grids; not
+    `Pairwise`) and, up to the floats' spacing, with adding a constant. What else holds is said of each scheme.
 
     With a `window` it settles a block of that size around what is too steep. The outcome says WINDOW_EDGE if a slope
     outside exceeds repose by more than the window's tolerance, or a cell within two cells of the block's edge (where that is

@@ -1,4 +1,4 @@
-"""One sweep of settling: every link passes on its flux (flux.py), times a rate, cut to whole quanta (bed.py)."""
+"""One sweep of settling: every link passes on its flux (flux.py), times a rate, cut to whole quanta (ghost_cells.py)."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, split
-from jaxsand.relaxation import _flux_adjoint as adjoint
-from jaxsand.relaxation._ghost_cells import Bed, Lost, at, halo, lose, truncate
+from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
+from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
 
 
 @jax.tree_util.register_dataclass

@@ -4,7 +4,7 @@ The cost sum r(x)^2 of residuals r (m) is brought down by Gauss-Newton steps (J^
 of J^T J (Levenberg 1944, Marquardt 1963, doi:10.1137/0111030). Parameters are measured in their ranges, x from 0 to 1, and
 stay there. An error bar has two parts. The noise's covariance is sigma^2 (J^T J)^-1, that of white noise sigma to first
 order, which is also the Cramer-Rao bound. The grid's is d d^T + e e^T, with d the way from the fit to where it would end on
-an ever finer grid, and e what may be wrong of d (limit.py): the same in every repetition of an experiment, and in one
+an ever finer grid, and e what may be wrong of d (_limit.py): the same in every repetition of an experiment, and in one
 proportion for all parameters.
 """
 

@@ -1,4 +1,5 @@
-"""Parameters of sand and tool from height maps before and after a push or a collapse; see fitting.py for the method."""
+"""Parameters of sand and tool from height maps before and after a push or a collapse; see _least_squares.py for the
+method."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,9 +18,9 @@ from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, concrete, fit
 from jaxsand.scene.tools import NoTool
-from jaxsand.terramechanics._finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 from jaxsand.terramechanics._least_squares import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
 from jaxsand.terramechanics._limit import Reference
+from jaxsand.terramechanics.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 
 Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"

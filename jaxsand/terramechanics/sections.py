@@ -1,7 +1,7 @@
-"""The angle of repose, and a wheel's pass, from sections across its trench; see fitting.py for the method. Host side.
+"""The angle of repose, and a wheel's pass, from sections across its trench; see _least_squares.py. Host side.
 
-The model of a section is a profile of trench.py laid where the scan was taken: z(x) = lift + tilt x + profile(x - shift).
-Derivatives are central differences.
+The model of a section is a profile of wheel_trench.py laid where the scan was taken: z(x) = lift + tilt x + profile(x -
+shift). Derivatives are central differences.
 """
 
 import math

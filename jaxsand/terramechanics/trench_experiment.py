@@ -1,7 +1,7 @@
 """The wheel's ruts: trenches simulated over slip angles and sinkages, beside what is known of them.
 
 The experiment of arXiv:1908.02745, section IV: a wheel is towed across level sand, and the section it leaves half-way is
-compared with the closed form and with the exact relaxation (trench.py), and with a user's scans (scans.py).
+compared with the closed form and with the exact relaxation (wheel_trench.py), and with a user's scans (scans.py).
 """
 
 import math
@@ -19,7 +19,7 @@ import numpy as np
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import Push, check, step
 from jaxsand.interaction.wheel_closed_form import SplitPush
-from jaxsand.relaxation._batching import cores
+from jaxsand.relaxation.batching import cores
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
 from jaxsand.scene.window import Window

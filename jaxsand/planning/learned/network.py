@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxsand.planning.learned._square_symmetries import turned, turned_back, turned_strokes, turned_strokes_back
+from jaxsand.planning.learned.square_symmetries import turned, turned_back, turned_strokes, turned_strokes_back
 
 Params = Any
 

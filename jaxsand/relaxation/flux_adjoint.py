@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.relaxation._ghost_cells import Bed, halo
+from jaxsand.relaxation.ghost_cells import Bed, halo
 from jaxsand.scene.grid import links
 
 Lattice = tuple[jax.Array, ...]  # a map [H + 1, W + 1] for each direction of links

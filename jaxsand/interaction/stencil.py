@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import linear_call
 
-from jaxsand.relaxation._ghost_cells import at, halo
 from jaxsand.relaxation.flux import Fluxes, ends, received
+from jaxsand.relaxation.ghost_cells import at, halo
 from jaxsand.scene.grid import Neighbours, links
 
 _SMALL = 24  # rows

@@ -20,7 +20,7 @@ The weight w of a link is how open it is. A cell of which the share o is open ri
 are stable if for every f the sum over cells of (sum of f)^2 / o is at most 2 sum of f^2 / (r w); with n links to a cell, all
 open, that is r n <= 1, and for others it holds if 2 / w >= 1 / o + 1 / o', the two ends': w is their harmonic mean at most.
 Isotropic sand couples two links in a gradient, which must have one weight: with each arm felt and moved by the same part a,
-1 but where a link is nearly closed, that is the lesser of the two w / a^2. Fluxes are whole quanta (bed.py).
+1 but where a link is nearly closed, that is the lesser of the two w / a^2. Fluxes are whole quanta (ghost_cells.py).
 """
 
 from dataclasses import dataclass, field
@@ -29,9 +29,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.interaction._stencil import both_ends, inner, net, outer, rises
-from jaxsand.relaxation._ghost_cells import nearest, truncate
+from jaxsand.interaction.stencil import both_ends, inner, net, outer, rises
 from jaxsand.relaxation.flux import Fluxes, ends
+from jaxsand.relaxation.ghost_cells import nearest, truncate
 from jaxsand.scene.grid import Neighbours, links
 
 _FELT = 0.25  # an arm of a gradient counts in full once it is so far open

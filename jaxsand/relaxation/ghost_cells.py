@@ -104,7 +104,8 @@ def grain(bed: Bed, u: jax.Array) -> jax.Array:
 def truncate(x: jax.Array) -> jax.Array:
     """Towards zero to a whole number; its derivative is taken to be that of the identity.
 
-    Reverse mode forgets such a rule after the first derivative: loops that use it must refuse a second one (loop.py does).
+    Reverse mode forgets such a rule after the first derivative: loops that use it must refuse a second one
+    (while_loop.py does).
     """
     return jnp.trunc(x)
 

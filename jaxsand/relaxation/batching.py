@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.relaxation._ghost_cells import Lost
 from jaxsand.relaxation._integrate import March
+from jaxsand.relaxation.ghost_cells import Lost
 
 _CELLS = 65_536  # to a chunk: what the sweep of a chunk keeps at hand fits into a core's cache
 _LEFT = 8  # a chunk stops when one in so many of its maps is left
