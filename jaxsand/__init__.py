@@ -1,11 +1,77 @@
 """jaxsand: robots that shape sand, simulated in JAX.
 
 A height map settles to its angle of repose after each action of a tool. Names are resolved on first use, so that importing
-the package does not wait for JAX.
+the package does not wait for JAX; type checkers and editors see them all.
 """
 
-from importlib import import_module
-from typing import Any
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxsand.envs import make as make
+    from jaxsand.interaction._path import Pushed as Pushed
+    from jaxsand.interaction.batched import step_batch as step_batch
+    from jaxsand.interaction.batched import value_and_grad_batch as value_and_grad_batch
+    from jaxsand.interaction.blade_closed_form import SwathPush as SwathPush
+    from jaxsand.interaction.blade_stepped import SteppedPush as SteppedPush
+    from jaxsand.interaction.simulate import OutcomeError as OutcomeError
+    from jaxsand.interaction.simulate import Shaped as Shaped
+    from jaxsand.interaction.simulate import act as act
+    from jaxsand.interaction.simulate import check as check
+    from jaxsand.interaction.simulate import follow as follow
+    from jaxsand.interaction.simulate import follow_frames as follow_frames
+    from jaxsand.interaction.simulate import rollout as rollout
+    from jaxsand.interaction.simulate import step as step
+    from jaxsand.interaction.wheel_closed_form import SplitPush as SplitPush
+    from jaxsand.planning.binary import Plan as Plan
+    from jaxsand.planning.binary import plan as plan
+    from jaxsand.planning.gradient import Blurred as Blurred
+    from jaxsand.planning.gradient import Optimised as Optimised
+    from jaxsand.planning.gradient import optimise_strokes as optimise_strokes
+    from jaxsand.planning.search import SandPlan as SandPlan
+    from jaxsand.planning.search import plan_sand as plan_sand
+    from jaxsand.planning.search.actions import Lattice as Lattice
+    from jaxsand.planning.search.actions import Steps as Steps
+    from jaxsand.relaxation.schemes import Multilevel as Multilevel
+    from jaxsand.relaxation.schemes import Pairwise as Pairwise
+    from jaxsand.relaxation.schemes import Relaxation as Relaxation
+    from jaxsand.relaxation.schemes import SuperTimeStepping as SuperTimeStepping
+    from jaxsand.relaxation.settling import Settled as Settled
+    from jaxsand.relaxation.settling import settle as settle
+    from jaxsand.relaxation.settling import settle_batch as settle_batch
+    from jaxsand.relaxation.settling import steepest_slope as steepest_slope
+    from jaxsand.relaxation.stopping import Outcome as Outcome
+    from jaxsand.relaxation.stopping import Sweeps as Sweeps
+    from jaxsand.relaxation.stopping import UntilStill as UntilStill
+    from jaxsand.scene.boundaries import Closed as Closed
+    from jaxsand.scene.boundaries import Draining as Draining
+    from jaxsand.scene.boundaries import Open as Open
+    from jaxsand.scene.boundaries import Walls as Walls
+    from jaxsand.scene.grid import Grid as Grid
+    from jaxsand.scene.material import DRY_SAND as DRY_SAND
+    from jaxsand.scene.material import Material as Material
+    from jaxsand.scene.scene import Scene as Scene
+    from jaxsand.scene.scene import make_scene as make_scene
+    from jaxsand.scene.scene import volume as volume
+    from jaxsand.scene.tools import Blade as Blade
+    from jaxsand.scene.tools import Grousers as Grousers
+    from jaxsand.scene.tools import NoTool as NoTool
+    from jaxsand.scene.tools import Pose as Pose
+    from jaxsand.scene.tools import Smooth as Smooth
+    from jaxsand.scene.tools import Wheel as Wheel
+    from jaxsand.scene.window import AsNeeded as AsNeeded
+    from jaxsand.scene.window import Whole as Whole
+    from jaxsand.scene.window import Window as Window
+    from jaxsand.terramechanics._least_squares import Calibration as Calibration
+    from jaxsand.terramechanics._least_squares import Verdict as Verdict
+    from jaxsand.terramechanics.calibration import Trial as Trial
+    from jaxsand.terramechanics.calibration import calibrate as calibrate
+    from jaxsand.terramechanics.finer import OneGrid as OneGrid
+    from jaxsand.terramechanics.finer import TwoGrids as TwoGrids
+    from jaxsand.terramechanics.sections import Section as Section
+    from jaxsand.terramechanics.sections import calibrate_sections as calibrate_sections
+
+    __version__: str
 
 _HOMES = {
     "AsNeeded": "scene.window",
@@ -17,7 +83,7 @@ _HOMES = {
     "Draining": "scene.boundaries",
     "Grid": "scene.grid",
     "Grousers": "scene.tools",
-    "Lattice": "planning.search",
+    "Lattice": "planning.search.actions",
     "Material": "scene.material",
     "Multilevel": "relaxation.schemes",
     "NoTool": "scene.tools",
@@ -39,7 +105,7 @@ _HOMES = {
     "Smooth": "scene.tools",
     "SplitPush": "interaction.wheel_closed_form",
     "SteppedPush": "interaction.blade_stepped",
-    "Steps": "planning.search",
+    "Steps": "planning.search.actions",
     "SuperTimeStepping": "relaxation.schemes",
     "SwathPush": "interaction.blade_closed_form",
     "Sweeps": "relaxation.stopping",
@@ -75,6 +141,8 @@ __all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return metadata.version("jaxsand")
     if name not in _HOMES:
         raise AttributeError(f"module 'jaxsand' has no attribute {name!r}")
     return getattr(import_module(f"jaxsand.{_HOMES[name]}"), name)

@@ -53,6 +53,14 @@ def test_what_is_heavy_or_private_is_imported_where_it_belongs():
             assert not module.startswith("_") or name.startswith(room), f"{name} imports {other}"
 
 
+def test_what_type_checkers_see_is_what_is_there():
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    seen = {a.asname: f"{node.module}" for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    assert seen == {name: f"jaxsand.{home}" for name, home in jaxsand._HOMES.items()}
+    assert jaxsand.__version__[0].isdigit()
+
+
 def test_no_module_hides_a_public_function():
     assert not {path.stem for path in PACKAGE.iterdir()} & set(jaxsand.__all__)
 
