@@ -102,7 +102,7 @@ class _Many:
         return self.call(params, k, state)
 
 
-def batched(program: Callable, loop: Lanes, params: Tree, *rest: Tree) -> Tree:
+def batched(program: Callable[..., Any], loop: Lanes, params: Tree, *rest: Tree) -> Tree:
     """`program(loop, params, *rest)`, which under `vmap` is the program over one more lane; all of `rest` gains the axis."""
 
     @custom_vmap
@@ -110,7 +110,7 @@ def batched(program: Callable, loop: Lanes, params: Tree, *rest: Tree) -> Tree:
         return program(loop, params, *rest)
 
     @run.def_vmap
-    def rule(size: int, mapped: list, params: Tree, rest: Tree) -> tuple[Tree, Tree]:
+    def rule(size: int, mapped: list[Any], params: Tree, rest: Tree) -> tuple[Tree, Tree]:
         if loop.trailing:
             out = _trailing(program, loop, size, mapped, (params, rest))
             return out, jax.tree.map(lambda _: True, out)
@@ -122,7 +122,7 @@ def batched(program: Callable, loop: Lanes, params: Tree, *rest: Tree) -> Tree:
     return run(params, rest)
 
 
-def _trailing(program: Callable, loop: Lanes, size: int, mapped: list, args: Tree) -> Tree:
+def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[Any], args: Tree) -> Tree:
     """`program` with one more batch in the last axis, chunk by chunk; the result gains the axis in front."""
     leaves, tree = jax.tree.flatten(args)
     yes = jax.tree.leaves(mapped)
@@ -130,7 +130,7 @@ def _trailing(program: Callable, loop: Lanes, size: int, mapped: list, args: Tre
     chunks = -(-size // chunk)
     chunk = -(-size // chunks)
 
-    def some(part: list) -> Tree:
+    def some(part: list[Any]) -> Tree:
         own = iter(part)
 
         def last(x: jax.Array, batched: bool) -> jax.Array:

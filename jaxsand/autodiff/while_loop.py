@@ -8,7 +8,7 @@ of steps that it turned out to take. What a step leaves on a tape for its deriva
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -114,12 +114,12 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
     # One flat vector, so that vmap sees a single operand that is batched or not.
     start, unravel = ravel_pytree((dparams, dstate))
 
-    def forward(_: Callable, vector: jax.Array) -> jax.Array:
+    def forward(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
         df, dx = unravel(vector)
         params, state, *_ = shown(kept)
         return ravel_pytree((df, lockstep.batched(lockstep.push, loop, params, state, count, df, dx)))[0]
 
-    def backward(_: Callable, vector: jax.Array) -> jax.Array:
+    def backward(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
         params, _, tape, saved = shown(kept)
         df, dx = lockstep.batched(lockstep.pull, loop, params, count, tape, saved, cx)

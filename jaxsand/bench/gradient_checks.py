@@ -48,7 +48,7 @@ class Case:
         return ", ".join(parts)
 
 
-def program(case: Case, cells: int) -> Callable:
+def program(case: Case, cells: int) -> Callable[..., Any]:
     """From a height [H, W], stroke, angle, and perhaps a stop rule: a weighted sum of the map that is left, and the sweeps
     that settling took."""
     weights = np.random.default_rng(9).standard_normal((cells, cells))
@@ -65,12 +65,12 @@ def program(case: Case, cells: int) -> Callable:
     return run
 
 
-def differentiated(run: Callable) -> Callable:
+def differentiated(run: Callable[..., Any]) -> Callable[..., Any]:
     """`((value, sweeps), gradient)`, of a batch."""
     return jax.vmap(sloped(run))
 
 
-def sloped(run: Callable) -> Callable:
+def sloped(run: Callable[..., Any]) -> Callable[..., Any]:
     """`((value, sweeps), gradient)`, by every input."""
     return jax.value_and_grad(run, (0, 1, 2), has_aux=True)
 
@@ -162,17 +162,17 @@ def relative(found: Any, right: Any) -> np.ndarray:
 
 
 @cache
-def _forward(case: Case, cells: int) -> Callable:
+def _forward(case: Case, cells: int) -> Callable[..., Any]:
     return jax.jit(jax.vmap(program(case, cells)))
 
 
 @cache
-def _gradient(case: Case, cells: int) -> Callable:
+def _gradient(case: Case, cells: int) -> Callable[..., Any]:
     return jax.jit(differentiated(program(case, cells)))
 
 
 @cache
-def _act_program() -> Callable:
+def _act_program() -> Callable[..., Any]:
     def one(height: Any, stroke: Any, angle: Any) -> Any:
         return act(make_scene(height.shape, SPACING, angle, tool=Blade()), height, stroke).height
 

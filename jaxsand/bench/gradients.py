@@ -99,19 +99,19 @@ def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...
     return rows
 
 
-def _together(run: Callable, count: int) -> Callable:
+def _together(run: Callable[..., Any], count: int) -> Callable[..., Any]:
     """`run` of a batch, so many at a time."""
     return lambda *x: jax.lax.map(lambda one: run(*one), x, batch_size=count)
 
 
-def _compiled(run: Callable, x: Inputs) -> tuple[Any, float, int]:
+def _compiled(run: Callable[..., Any], x: Inputs) -> tuple[Any, float, int]:
     """The program, the seconds that compiling it took, and the bytes it holds for itself while it runs."""
     began = time.perf_counter()
     compiled = jax.jit(run).lower(*x).compile()
     return compiled, time.perf_counter() - began, getattr(compiled.memory_analysis(), "temp_size_in_bytes", 0)
 
 
-def _race(ways: list[Callable], rounds: int) -> list[float]:
+def _race(ways: list[Callable[..., Any]], rounds: int) -> list[float]:
     """Best time of each, in turns, after a first call."""
     best = [math.inf] * len(ways)
     for turn in range(rounds + 1):
@@ -186,7 +186,7 @@ def stopped_early(
     return rows
 
 
-def _stopping(run: Callable, stop: Stop, x: Inputs) -> tuple[Callable, Callable]:
+def _stopping(run: Callable[..., Any], stop: Stop, x: Inputs) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The gradient and the forward run with a stop rule."""
 
     def stopped(height: Any, stroke: Any, angle: Any) -> Any:

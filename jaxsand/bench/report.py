@@ -156,7 +156,7 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
     }
     settle_c = compile_c()
     if settle_c is not None:
-        c: Callable = settle_c
+        c: Callable[..., Any] = settle_c
 
         def threads(n: int, **rule: Any) -> tuple[Any, Any]:
             parts = np.array_split(host.copy(), n)

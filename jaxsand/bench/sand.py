@@ -17,7 +17,7 @@ from jaxsand.planning.search.tasks import SAND_TASKS, SandTask, sand_task
 
 Tell = Callable[[str], None]
 
-_STROKES: dict[str, Callable] = {
+_STROKES: dict[str, Callable[..., Any]] = {
     "binary plan": rivals.binary,
     "greedy": rivals.greedy,
     "greedy, ranked": rivals.greedy_ranked,
@@ -25,7 +25,7 @@ _STROKES: dict[str, Callable] = {
     "random shooting": rivals.shooting,
     "layers alone": rivals.layers,
 }
-_STEPS: dict[str, Callable] = {
+_STEPS: dict[str, Callable[..., Any]] = {
     "binary plan": rivals.binary,
     "greedy": rivals.greedy_steps,
     "random shooting": rivals.random_walks,

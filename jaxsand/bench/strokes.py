@@ -201,7 +201,7 @@ def _at(history: list[Best], budget: int) -> Best | None:
     return next((best for best in reversed(history) if best.calls <= budget), None)
 
 
-def _key(row: Row) -> tuple:
+def _key(row: Row) -> tuple[Any, ...]:
     return row["method"], row["goal"], row["seed"], row["strokes"]
 
 
@@ -216,7 +216,7 @@ def _append(path: Path, line: str) -> None:
         file.write(line + "\n")
 
 
-def _known(path: Path) -> dict[tuple, Row]:
+def _known(path: Path) -> dict[tuple[Any, ...], Row]:
     """The rows of a file by their keys, of several those with most calls; lines that were cut off are left out."""
     rows = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.is_file() else [], 1):

@@ -210,7 +210,7 @@ def _coloured(height: np.ndarray) -> np.ndarray:
     return _LEVEL + np.maximum(-part, 0) * (_LOW - _LEVEL) + np.maximum(part, 0) * (_HIGH - _LEVEL)
 
 
-def _spaces(core: Any, params: Any) -> tuple[spaces.Space, spaces.Space]:
+def _spaces(core: Any, params: Any) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     shown, action = core.observation_space(params).spaces, core.action_space(params)
     observation = spaces.Dict(_view({name: _box(box) for name, box in shown.items()}))
     return observation, _box(action) if isinstance(action, Box) else spaces.Discrete(action.n)
@@ -241,7 +241,7 @@ def _key(random: np.random.Generator) -> jax.Array:
 
 
 @cache
-def _programs(core: Any, step: Any) -> tuple[Callable, Callable]:
+def _programs(core: Any, step: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """`reset` and a step of one environment, with the mask of actions where it has one."""
 
     def about(state: Any, params: Any) -> Obs:

@@ -70,7 +70,7 @@ def _alone(push: Push, stop: Stop | None) -> Pushing:
 def by_length(way: ByLength, alone: Pushing) -> Pushing:
     """A push that vmap batches that way, and so its derivatives; they are those of the push alone."""
 
-    def of_floats(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[Callable, Any]:
+    def of_floats(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[Callable[..., Any], Any]:
         """The map that is left as a function of all floats, and these."""
         floats, merge = split((scene, stroke))
 
@@ -100,11 +100,11 @@ def by_length(way: ByLength, alone: Pushing) -> Pushing:
         dfloats = tuple(d for d in jax.tree.leaves((dscene, dstroke)) if d.dtype != jax.dtypes.float0)
         start, unravel = ravel_pytree((dfloats, dbefore))
 
-        def solve(_: Callable, vector: jax.Array) -> jax.Array:
+        def solve(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
             dfloats, dbefore = unravel(vector)
             return ravel_pytree((dfloats, forwards(*primals, dfloats, dbefore)))[0]
 
-        def transpose(_: Callable, vector: jax.Array) -> jax.Array:
+        def transpose(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
             to_floats, gain = unravel(vector)
             more, to_before = backwards(*primals, gain)
             return ravel_pytree((jax.tree.map(jnp.add, to_floats, more), to_before))[0]
@@ -122,7 +122,7 @@ def by_length(way: ByLength, alone: Pushing) -> Pushing:
 
 
 @cache
-def sorted_by_length(way: ByLength, alone: Callable) -> Callable:
+def sorted_by_length(way: ByLength, alone: Callable[..., Any]) -> Callable[..., Any]:
     """A function of a scene, a map, a stroke and more that vmap batches that way; without derivatives."""
     one = custom_vmap(alone)
 

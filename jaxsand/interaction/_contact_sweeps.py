@@ -97,7 +97,7 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
     most = adjoint.yields(bed)
     per_cell = bool(bed.drop.ndim)
 
-    def stage(j: jax.Array, carry: tuple) -> tuple:
+    def stage(j: jax.Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         gain, excess, tilt, lift, moved = carry
         s = halo(lax.dynamic_index_in_dim(tape, sweeps - 1 - j, keepdims=False))
         rises = adjoint.steps(bed, s)

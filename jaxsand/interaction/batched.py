@@ -90,7 +90,13 @@ def value_and_grad_batch(
 
 
 def _batch(
-    program: Callable, scene: Scene, height: Any, stroke: Any, rules: Any, chunk: int | None, args: tuple = ()
+    program: Callable[..., Any],
+    scene: Scene,
+    height: Any,
+    stroke: Any,
+    rules: Any,
+    chunk: int | None,
+    args: tuple[Any, ...] = (),
 ) -> Any:
     height = as_batch(height)
     stroke = as_array("stroke", stroke, height.dtype)
@@ -145,7 +151,7 @@ def _gradient_program(loss: Loss) -> Any:
     def run(scene: Scene, rules: Rules, batch: Any) -> Any:
         push, scheme, stop = rules
 
-        def one(height: jax.Array, stroke: jax.Array, args: tuple) -> tuple[jax.Array, jax.Array]:
+        def one(height: jax.Array, stroke: jax.Array, args: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
             shaped = step(scene, height, stroke, push=push, scheme=scheme, stop=stop)
             return loss(shaped.height, *args), shaped.outcome
 

@@ -20,7 +20,7 @@ from jaxsand.scene.grid import Neighbours, links
 _SMALL = 24  # rows
 
 
-def _linear(forth: Callable, back: Callable, x: Any) -> Any:
+def _linear(forth: Callable[..., Any], back: Callable[..., Any], x: Any) -> Any:
     return linear_call(lambda _, x: forth(x), lambda _, y: back(y), (), x)
 
 

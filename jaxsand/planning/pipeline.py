@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -229,7 +229,7 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
 
 
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:
-    def reduction(view: Callable) -> float:
+    def reduction(view: Callable[..., Any]) -> float:
         return float(task.l2_reduction(view(target.goal), view(before.astype(float)), view(after.astype(float))))
 
     whole = reduction(lambda h: h)
@@ -248,7 +248,7 @@ def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array]
     began = time.perf_counter()
     height = jax.ShapeDtypeStruct(scene.grid.shape, np.float32)
     path = jax.ShapeDtypeStruct((points, 2), np.float32)
-    program: Callable = jax.jit(partial(follow_frames, scene)).lower(height, path).compile()
+    program: Callable[..., Any] = jax.jit(partial(follow_frames, scene)).lower(height, path).compile()
     return program, time.perf_counter() - began
 
 

@@ -32,7 +32,7 @@ class March:
 
     begin: Callable[[Sand], Any]
     body: Step
-    done: Callable
+    done: Callable[..., Any]
     between: Callable[[jax.Array], Any]
     params: Any
     interval: int

@@ -25,7 +25,13 @@ Tree = Any
 
 
 def march_batch(
-    march: March, groups: int, enter: Callable, judge: Callable, height: jax.Array, lost: Lost, chunk: int
+    march: March,
+    groups: int,
+    enter: Callable[..., Any],
+    judge: Callable[..., Any],
+    height: jax.Array,
+    lost: Lost,
+    chunk: int,
 ) -> Tree:
     """`March.run` for every map of a batch [B, H, W], B a multiple of the chunk.
 
@@ -42,7 +48,7 @@ def march_batch(
     return state[0]
 
 
-def _left_over(run: Callable, chunk: int, state: Tree) -> Tree:
+def _left_over(run: Callable[..., Any], chunk: int, state: Tree) -> Tree:
     """Chunks of the maps that are left march on."""
     _, _, taken, ready = state
     order = jnp.argsort(jnp.where(ready, jnp.iinfo(jnp.int32).max, taken))
@@ -58,7 +64,15 @@ def _left_over(run: Callable, chunk: int, state: Tree) -> Tree:
 
 
 def _together(
-    march: March, groups: int, enter: Callable, judge: Callable, others: Any, height: Any, lost: Any, taken: Any, ready: Any
+    march: March,
+    groups: int,
+    enter: Callable[..., Any],
+    judge: Callable[..., Any],
+    others: Any,
+    height: Any,
+    lost: Any,
+    taken: Any,
+    ready: Any,
 ) -> Tree:
     """Marches maps [chunk, ...] until all are ready; where there are `others`, until all but a few are."""
     few = ready.shape[0] // _LEFT
@@ -151,7 +165,7 @@ def group_size(total: int, chunk: int | None) -> int:
     return next((size for size in SIZES if size * cores() >= total), SIZES[-1])
 
 
-def _refuse_tracers(leaves: list) -> None:
+def _refuse_tracers(leaves: list[Any]) -> None:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         raise ValueError(
             "settle_batch, step_batch and their like are outermost programs: inside jit, grad or vmap use jax.vmap of "

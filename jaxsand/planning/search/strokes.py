@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -93,7 +94,7 @@ def improved(job: Job, plans: np.ndarray, budget: float, rng: np.random.Generato
     return plans[best][: int(distance(ways[best], job.goal).argmin())], effort
 
 
-def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push: Callable = pushed) -> np.ndarray:
+def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push: Callable[..., Any] = pushed) -> np.ndarray:
     """The maps on the way of plans [m, n, 4] from stroke `first` on, [n - first + 1, m, H, W], from `start` [1, H, W]."""
     maps = [np.repeat(start, len(plans), axis=0)]
     for k in range(first, plans.shape[1]):
