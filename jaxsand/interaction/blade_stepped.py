@@ -154,6 +154,7 @@ def _far(width: Any, thickness: Any) -> Any:
     return ((width + 1) ** 2 + (thickness + 1) ** 2) ** 0.5 / 2 + 1
 
 
+_TOLERANCE = 2e-4  # spacings by which sand may move at the edge of a window: what it changes inside is up to 20 times that
 _LEAST = 1.5  # times a window's width: the map's, for the window to save work
 
 
@@ -174,6 +175,6 @@ def windows_for(scene: Scene, push: Any, times: float = 1) -> Iterator[Scene]:
     size = 2 * math.ceil(cells / 2)
     while size * _LEAST <= max(scene.grid.shape):
         rows, columns = scene.grid.shape
-        window = Window((min(size, rows), min(size, columns)), jnp.asarray(1e-3, jnp.result_type(scene.grid.spacing)))
+        window = Window((min(size, rows), min(size, columns)), jnp.asarray(_TOLERANCE, jnp.result_type(scene.grid.spacing)))
         yield with_near(replace(scene, window=window))
         size *= 2

@@ -1,5 +1,6 @@
 """The simulator: a tool acts, the sand settles."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,13 +14,15 @@ from jaxsand.interaction.blade_closed_form import SwathPush, push_swath
 from jaxsand.interaction.blade_stepped import SteppedPush, push_along, windows_for, with_near
 from jaxsand.interaction.wheel_closed_form import SplitPush, push_split
 from jaxsand.interaction.wheel_stepped import roll_along
-from jaxsand.relaxation.schemes import Scheme
+from jaxsand.relaxation.schemes import Multilevel, Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rate, check_rule, check_whole
 from jaxsand.scene.scene import Scene, as_array, cast, concrete, fit
 from jaxsand.scene.tools import Blade, NoTool, Pose, Wheel
+from jaxsand.scene.window import Whole, Window
 
 Push = SteppedPush | SwathPush | SplitPush
+Rules = tuple[Push, Scheme, Stop]
 _PUSHES: dict[tuple[type, type], Any] = {
     (Blade, SteppedPush): push_along,
     (Blade, SwathPush): push_swath,
@@ -49,7 +52,7 @@ def act(scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike
     """
     scene, height, rules = ready(scene, height, push, None, None)
     path = _stroke(stroke, height.dtype)
-    return _as_needed(lambda scene: _act(scene, height, path, rules), scene, rules[0], (height, path))
+    return _as_needed(lambda scene, _: _act(scene, height, path, rules), scene, rules, (height, path))
 
 
 def step(
@@ -98,7 +101,7 @@ def follow(
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
-    return _as_needed(lambda scene: _follow(scene, height, path, rules)[0], scene, rules[0], (height, path))
+    return _as_needed(partial(_followed, height, path, rules), scene, rules, (height, path))
 
 
 def follow_frames(
@@ -113,7 +116,7 @@ def follow_frames(
     """`follow`, and the map after each leg, before the tool is lifted: [n - 1, H, W] (m)."""
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
-    return _as_needed(lambda scene: _follow(scene, height, path, rules, record=_itself), scene, rules[0], (height, path))
+    return _as_needed(lambda scene, _: _follow(scene, height, path, rules, record=_itself), scene, rules, (height, path))
 
 
 def rollout(
@@ -130,19 +133,30 @@ def rollout(
     strokes = as_array("strokes", strokes, height.dtype)
     if strokes.ndim != 2 or strokes.shape[1] != 4:
         raise ValueError(f"strokes: got shape {list(strokes.shape)}; give [n, 4], a row x0, y0, x1, y1 for each push")
-    return _as_needed(lambda scene: _rollout(scene, height, strokes, rules), scene, rules[0], (height, strokes))
+    return _as_needed(lambda scene, _: _rollout(scene, height, strokes, rules), scene, rules, (height, strokes))
 
 
-def _as_needed(run: Callable[[Scene], Any], scene: Scene, push: Push, arrays: Any) -> Any:
-    """What a run in a window around the blade gives, as wide as the sand asks for; traced, in one that is likely enough."""
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, push, arrays))):
-        return run(next(windows_for(scene, push, _SURE), scene))
-    for part in windows_for(scene, push):
-        out = run(part)
+def _as_needed(run: Callable[[Scene, Whole | Window], Any], scene: Scene, rules: Rules, arrays: tuple[Any, Any]) -> Any:
+    """What a run gives in a window around the blade, and settled in one around where it went, as wide as the sand asks for;
+    traced, in a window that is likely enough."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, rules, arrays))):
+        return run(next(windows_for(scene, rules[0], _SURE), scene), Whole())
+    for part in windows_for(scene, rules[0]):
+        out = run(part, _around(part, arrays[1], rules[1]))
         outcome = (out[0] if isinstance(out, tuple) else out).outcome
         if not np.any(np.asarray(outcome) & Outcome.WINDOW_EDGE):
             return out
-    return run(scene)
+    return run(scene, Whole())
+
+
+def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
+    """A window that holds a path, and what its blade's window holds at its ends, if the map is much wider."""
+    far = float(np.max(np.ptp(np.asarray(path), axis=0))) / float(scene.grid.spacing)
+    if isinstance(scheme, Multilevel) or not isinstance(scene.window, Window) or not far < max(scene.grid.shape):
+        return Whole()
+    size = 1 << math.ceil(math.log2(far + 2 * max(scene.window.size)))
+    rows, columns = scene.grid.shape
+    return Window((min(size, rows), min(size, columns))) if 4 * size <= max(rows, columns) else Whole()
 
 
 class OutcomeError(RuntimeError):
@@ -180,9 +194,6 @@ def check(result: Settled | Pushed) -> None:
         detail["sweeps"] = int(np.broadcast_to(result.sweeps, outcome.shape).ravel()[first])
     where = f"{bad.size} of {outcome.size} maps, first {int(first)}: " if outcome.ndim else ""
     raise OutcomeError(where + "; ".join(advice.format(**detail) for bit, advice in _ADVICE.items() if bit in code))
-
-
-Rules = tuple[Push, Scheme, Stop]
 
 
 def way_of(scene: Scene, push: Push) -> Any:
@@ -238,11 +249,22 @@ def _itself(height: jax.Array) -> jax.Array:
     return height
 
 
+def _followed(height: jax.Array, path: jax.Array, rules: Rules, scene: Scene, window: Whole | Window) -> Shaped:
+    return _follow(scene, height, path, rules, window=window)[0]
+
+
 @partial(jax.jit, static_argnames="record")
-def _follow(scene: Scene, height: jax.Array, path: jax.Array, rules: Rules, record: Any = None) -> tuple[Shaped, Any]:
+def _follow(
+    scene: Scene,
+    height: jax.Array,
+    path: jax.Array,
+    rules: Rules,
+    record: Any = None,
+    window: Whole | Window | None = None,
+) -> tuple[Shaped, Any]:
     push, scheme, stop = rules
     pushed, frames = way_of(scene, push)(scene, height, path, push, record)
-    return lifted(pushed, relax(scene, pushed.height, scheme, stop)), frames
+    return lifted(pushed, relax(scene, pushed.height, scheme, stop, Whole() if window is None else window)), frames
 
 
 def lifted(pushed: Pushed, settled: Settled) -> Shaped:
