@@ -15,7 +15,7 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way, pose_ahead
+from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way
 from jaxsand.interaction._frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
 from jaxsand.interaction._resting_adjoint import Rested, blank, rest_pulled, rest_taped
 from jaxsand.interaction.resting import Links, Sand, bring_to_rest
@@ -117,13 +117,13 @@ class Advance(Step):
 
     def block_of(self, way: Way, frame: Frame, k: jax.Array) -> tuple[First, First]:
         """Where the block of step k begins, and by how much that has moved."""
-        begins = []
-        for j in (jnp.maximum(k - 1, 0), k):
-            middle = (jnp.maximum(j - int(self.lowered), 0).astype(way.length.dtype) + 0.5) * (self.chunk * self.substep)
-            pose = pose_ahead(frame, jnp.minimum(middle, way.length))
-            begins.append(self.block.corner(pose.x, pose.y))
-        old, new = begins
+        old, new = self.block.corners(frame, *(self._middle(way, j) for j in (jnp.maximum(k - 1, 0), k)))
         return new, (new[0] - old[0], new[1] - old[1])
+
+    def _middle(self, way: Way, k: jax.Array) -> jax.Array:
+        """How far ahead the tool is halfway through step k."""
+        steps = jnp.maximum(k - int(self.lowered), 0).astype(way.length.dtype)
+        return jnp.minimum((steps + 0.5) * (self.chunk * self.substep), way.length)
 
     def felt(self, way: Way, k: jax.Array, first: First, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The share of each cell that the blade covers at any time in step k, and the rate at which sand flows then."""

@@ -105,6 +105,18 @@ class Block:
         begin = [jnp.floor(lax.stop_gradient(centre)).astype(jnp.int32) - behind for centre in (x, y)]
         return begin[0], begin[1]
 
+    def corners(self, frame: Frame, before: jax.Array, after: jax.Array) -> tuple[First, First]:
+        """The first cells of the blocks around where the tool is after two ways ahead.
+
+        The two are computed as one array. As two expressions a compiler may join products and sums in one and not in the
+        other, and what is `after` now is `before` a step later: where a centre is on the border of two cells, once in a
+        hundred thousand strokes, the block would have been elsewhere than remembered.
+        """
+        pose, ways = jax.tree.map(lax.stop_gradient, (frame.pose, jnp.stack([before, after])))
+        firsts = self.corner(pose.x + ways * pose.cos, pose.y + ways * pose.sin)
+        x, y = lax.optimization_barrier(firsts)
+        return (x[0], y[0]), (x[1], y[1])
+
     def coordinates(self, frame: Frame, first: First) -> tuple[jax.Array, jax.Array]:
         """How far ahead of a pose, and to its left, the cells that are near it, and a halo, lie (spacings)."""
         size = self.near + 2
