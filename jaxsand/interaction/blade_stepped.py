@@ -169,7 +169,8 @@ def windows_for(scene: Scene, push: Any, times: float = 1) -> Iterator[Scene]:
         return
     width, thickness, depth, dx = (float(x) for x in parts if x is not None)
     heap = math.sqrt(width * max(depth, dx / 2) / math.tan(float(np.min(angle))))
-    cells = times * (math.hypot(width, thickness) + 3.3 * heap) / dx + 2 * SPARE
+    spread = 2 if scene.grid.neighbours == "isotropic" else 0  # whose gradients reach farther
+    cells = times * (math.hypot(width, thickness) + 3.3 * heap) / dx + 2 * SPARE + spread
     if not cells * _LEAST <= max(scene.grid.shape):
         return
     size = 2 * math.ceil(cells / 2)
