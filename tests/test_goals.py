@@ -141,3 +141,26 @@ def test_map_goals_are_the_right_way_up():
         import jaxsand as js
 
         task.fits(js.make_scene((8, 8), 0.01), goal)
+
+
+def refusal(path):
+    try:
+        assert goals.read_heights(path).ndim == 2
+    except ValueError as error:
+        return str(error)
+
+
+def test_spoilt_heights_are_refused_in_one_line(tmp_path):
+    np.save(tmp_path / "h.npy", np.eye(3))
+    good, rng = (tmp_path / "h.npy").read_bytes(), np.random.default_rng(0)
+    bad = tmp_path / "bad.npy"
+    for _ in range(300):
+        spoilt = bytearray(good)
+        for place in rng.integers(0, 128, rng.integers(1, 4)):
+            spoilt[place] = rng.integers(0, 256)
+        bad.write_bytes(spoilt)
+        message = refusal(bad)
+        assert message is None or (message.startswith(str(bad)) and "\n" not in message)
+    bad.write_bytes(b"ncols 3\nnrows 3\n")
+    with pytest.raises(ValueError, match=r"cannot be read as a \.npy array \(it does not begin as one\); save one"):
+        goals.read_heights(bad)

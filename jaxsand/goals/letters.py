@@ -98,10 +98,13 @@ def read_image(path: str | Path) -> np.ndarray:
 
 
 def read_heights(path: str | Path) -> np.ndarray:
-    """A height map [H, W] (m) from a .npy file."""
+    """A height map [H, W] (m) from a .npy file; its row 0 is at y = 0, where a picture's is on top."""
     try:
+        with Path(path).open("rb") as file:
+            if file.read(6) != b"\x93NUMPY":
+                raise ValueError("it does not begin as one")
         heights = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError) as error:
+    except Exception as error:  # a spoilt header may raise anything, from a tokenizer's errors to a lack of memory
         raise ValueError(f"{path}: cannot be read as a .npy array ({_reason(error)}); save one with numpy.save") from None
     if not isinstance(heights, np.ndarray) or heights.ndim != 2 or not heights.size:
         shape = list(getattr(heights, "shape", []))
