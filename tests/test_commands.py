@@ -297,3 +297,15 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         raise OSError(28, "No space left on device")
     assert target.read_text() == "old"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["result.json"]
+
+
+def test_pictures_do_not_depend_on_the_users_matplotlib(tmp_path):
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nimage.origin: lower\n")
+    (tmp_path / "map.txt").write_text("###\n#.#\n")
+    of_the_user = {"MPLBACKEND": "module://none.here", "MATPLOTLIBRC": str(tmp_path / "matplotlibrc")}
+    pictures = []
+    for environment in ({}, of_the_user):
+        command = [sys.executable, "-m", "jaxsand", "plan", "map.txt", "--out", "."]
+        subprocess.run(command, cwd=tmp_path, env=os.environ | environment, check=True, capture_output=True)
+        pictures.append((tmp_path / "plan-map.png").read_bytes())
+    assert pictures[0] == pictures[1]

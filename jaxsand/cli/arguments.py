@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
@@ -82,6 +83,14 @@ def fail(message: str) -> int:
         print("\r\033[K", end="", file=sys.stderr)
     print("error: " + " ".join(message.split()), file=sys.stderr)
     return 2
+
+
+def draw_alike_everywhere() -> None:
+    """Has matplotlib write files by its own defaults, whatever the user's notebooks and settings ask for."""
+    os.environ["MPLBACKEND"] = "agg"
+    found = find_spec("matplotlib")
+    for place in (found.submodule_search_locations or []) if found else []:
+        os.environ["MATPLOTLIBRC"] = str(Path(place) / "mpl-data" / "matplotlibrc")
 
 
 def keep_compiled_programs() -> None:

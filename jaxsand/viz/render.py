@@ -38,7 +38,8 @@ def shape_figure(result: ShapeResult) -> "Figure":
     axes[1, 1].set(xlabel="x (m)", ylabel="y (m)")
     figure.suptitle(
         f"{target.name}: {result.steps} {'steps' if target.method == 'plan' else 'strokes'}, "
-        f"IoU {f['iou']:.3f}, l2 reduction {f['l2_reduction']:.3f}, steepest slope {f['max_slope_deg']:.1f}°"
+        f"IoU {f['iou']:.3f}, l2 reduction {f['l2_reduction']:.3f}, steepest slope {f['max_slope_deg']:.1f}°",
+        parse_math=False,  # a goal may be called $a$
     )
     return figure
 
