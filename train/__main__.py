@@ -5,7 +5,7 @@ import math
 import sys
 from typing import Any
 
-from jaxsand.cli.arguments import Parser, count, draw_alike_everywhere, ended, keep_compiled_programs, path_name, seed, width
+from jaxsand.cli.arguments import Parser, count, draw_without_a_screen, ended, keep_compiled_programs, path_name, seed, width
 from train.commands import MINUTES, SHIPPED, run_evaluation, run_shipping, run_training
 
 _STEPS = {
@@ -23,7 +23,7 @@ _ABOUT = {
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
-    draw_alike_everywhere()
+    draw_without_a_screen()
     keep_compiled_programs()
     return ended(lambda: options.command(options))
 

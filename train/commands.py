@@ -141,7 +141,7 @@ def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], Non
 
         write_json(out / _REPORT, report)
         with written(out / "evaluate.png") as path:
-            save_figure(picture(glyphs, report), path)
+            save_figure(lambda: picture(glyphs, report), path)
     return report
 
 

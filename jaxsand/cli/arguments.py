@@ -4,7 +4,6 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
@@ -85,12 +84,9 @@ def fail(message: str) -> int:
     return 2
 
 
-def draw_alike_everywhere() -> None:
-    """Has matplotlib write files by its own defaults, whatever the user's notebooks and settings ask for."""
+def draw_without_a_screen() -> None:
+    """Has matplotlib write files, whatever the user's notebooks ask for."""
     os.environ["MPLBACKEND"] = "agg"
-    found = find_spec("matplotlib")
-    for place in (found.submodule_search_locations or []) if found else []:
-        os.environ["MATPLOTLIBRC"] = str(Path(place) / "mpl-data" / "matplotlibrc")
 
 
 def keep_compiled_programs() -> None:

@@ -22,27 +22,27 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
         if report.get("work_precision"):
             with written(out / f"bench-{options.what}.png") as path:
-                save_figure(work_precision_figure(report["work_precision"]), path)
+                save_figure(lambda: work_precision_figure(report["work_precision"]), path)
         if "plan_by_size" in report:
             with written(out / "bench-plan.png") as path:
-                save_figure(complexity_figure(report), path)
+                save_figure(lambda: complexity_figure(report), path)
             with written(out / "bench-plan-alpha.png") as path:
-                save_figure(alpha_figure(report), path)
+                save_figure(lambda: alpha_figure(report), path)
         if "trench_by_spacing" in report:
             from jaxsand.viz.trenches import spacing_figure
 
             with written(out / "bench-trench.png") as path:
-                save_figure(spacing_figure(report["trench_by_spacing"]), path)
+                save_figure(lambda: spacing_figure(report["trench_by_spacing"]), path)
         if "strokes_curves" in report:
             from jaxsand.bench.strokes import REACHED, found
             from jaxsand.viz.strokes import found_figure, strokes_figure
 
             with written(out / "bench-strokes.png") as path:
-                save_figure(strokes_figure(report["strokes_curves"], REACHED), path)
+                save_figure(lambda: strokes_figure(report["strokes_curves"], REACHED), path)
             shown = found(strokes["goals"], report["strokes_curves"])
             if shown:
                 with written(out / "bench-strokes-found.png") as path:
-                    save_figure(found_figure(shown), path)
+                    save_figure(lambda: found_figure(shown), path)
         write_json(out / f"bench-{options.what}.json", report)
     tell("")
     show(options, report, table)

@@ -11,7 +11,7 @@ from jaxsand.cli import SCHEMES, run_benchmark, run_plan, run_settle, run_shape,
 from jaxsand.cli.arguments import (
     Parser,
     count,
-    draw_alike_everywhere,
+    draw_without_a_screen,
     ended,
     keep_compiled_programs,
     neighbours,
@@ -25,7 +25,7 @@ from jaxsand.cli.arguments import (
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
-    draw_alike_everywhere()
+    draw_without_a_screen()
     if options.run is not run_benchmark:  # which tells compile time apart
         keep_compiled_programs()
     return ended(lambda: options.run(options))

@@ -52,7 +52,7 @@ def run_plan(options: argparse.Namespace) -> None:
         report["files"] = [str(file) for file in files]
         tell("drawing")
         with written(files[0]) as path:
-            save_figure(plan_figure(dig, found), path)
+            save_figure(lambda: plan_figure(dig, found), path)
         write_json(files[1], report)
     tell("")
     show(options, report, lines)

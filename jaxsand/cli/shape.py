@@ -52,7 +52,7 @@ def run_shape(options: argparse.Namespace) -> None:
     began = time.perf_counter()
     files = {name: out / name for name in ("result.json", "shape.png", "shape.gif")}
     with written(files["shape.png"]) as path:
-        save_figure(shape_figure(result), path)
+        save_figure(lambda: shape_figure(result), path)
     with written(files["shape.gif"]) as path:
         save_animation(result, path)
     if target.method == "strokes":  # a glyph's goal is pushed first, by the same program

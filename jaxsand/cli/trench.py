@@ -37,8 +37,8 @@ def run_trench(options: argparse.Namespace) -> None:
         with ExitStack() as all_of_them:  # take their places together
             paths = [all_of_them.enter_context(written(file)) for file in files]
             _write_profiles(profiles, paths[0])
-            save_figure(profiles_figure(profiles), paths[1])
-            save_figure(errors_figure(profiles), paths[2])
+            save_figure(lambda: profiles_figure(profiles), paths[1])
+            save_figure(lambda: errors_figure(profiles), paths[2])
             paths[3].write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
     tell("")
     show(options, report, _table)

@@ -9,6 +9,8 @@ from jaxsand.planning.binary import Plan
 from jaxsand.planning.pipeline import ShapeResult
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -149,9 +151,12 @@ def alpha_figure(report: dict[str, Any]) -> "Figure":
     return figure
 
 
-def save_figure(figure: "Figure", path: Path) -> None:
-    """Writes a PNG."""
-    figure.savefig(path, dpi=110, format="png")
+def save_figure(draw: "Callable[[], Figure]", path: Path) -> None:
+    """Draws a figure and writes it as PNG, by matplotlib's own defaults whatever the user's settings ask for."""
+    import matplotlib.style
+
+    with matplotlib.style.context("default"):
+        draw().savefig(path, dpi=110, format="png")
 
 
 def save_animation(result: ShapeResult, path: Path, width: int = 420, milliseconds: int = 90) -> None:
