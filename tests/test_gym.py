@@ -183,3 +183,9 @@ def test_stable_baselines_finds_nothing_wrong():
         warnings.simplefilter("ignore")
         check(multi().unwrapped)
         check(single().unwrapped)
+
+
+def test_forked_processes_are_told_what_to_do_instead_of_hanging(monkeypatch):
+    monkeypatch.setattr("jaxsand.envs.gymnasium._AT_HOME", -1)
+    with pytest.raises(RuntimeError, match=r'vectorization_mode: .*forked.*"context": "spawn"'):
+        gymnasium.make("jaxsand/MultiStroke-v0")

@@ -13,6 +13,7 @@ not begin anew by itself.
 Needs the extra `gym`: pip install 'jaxsand[gym]'.
 """
 
+import os
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, ClassVar
@@ -30,8 +31,19 @@ from jaxsand.envs import Box, MultiStroke, OnMap, make
 SINGLE, MULTI = "jaxsand/SingleStroke-v0", "jaxsand/MultiStroke-v0"
 _LOW, _LEVEL, _HIGH, _TOOL = (np.array(c, float) for c in ((30, 60, 130), (222, 196, 150), (110, 60, 20), (200, 30, 30)))
 _PIXELS = 256  # along a panel of a picture, about
+_AT_HOME = os.getpid()  # the process that this module was imported in
 
 Obs = dict[str, Any]
+
+
+def _refuse_forks() -> None:
+    """Raises RuntimeError in a process that was forked: JAX's threads are not there, and its first program would wait for
+    them without end."""
+    if os.getpid() != _AT_HOME:
+        raise RuntimeError(
+            "vectorization_mode: got processes that were forked, in which JAX does not run; give make_vec "
+            'vector_kwargs={"context": "spawn"}, or vectorization_mode="vector_entry_point", which is one program and faster'
+        )
 
 
 def _known(space: Any, actions: Any, shape: tuple[int, ...]) -> None:
@@ -53,6 +65,7 @@ class _Sand(gymnasium.Env):
     task: ClassVar[str]
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
+        _refuse_forks()
         self.render_mode = _renders(render_mode)
         self.core, self.params = make(self.task, **options)
         self.observation_space, self.action_space = _spaces(self.core, self.params)
