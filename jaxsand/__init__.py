@@ -138,11 +138,14 @@ _HOMES = {
     "volume": "scene.scene",
 }
 __all__ = [*_HOMES]
+_OTHER_NAMES = ("env", "forces", "gym", "task", "trench")  # modules
 
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return metadata.version("jaxsand")
+    if name in _OTHER_NAMES:
+        return import_module(f"jaxsand.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'jaxsand' has no attribute {name!r}")
     return getattr(import_module(f"jaxsand.{_HOMES[name]}"), name)

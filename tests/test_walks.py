@@ -10,6 +10,7 @@ import jaxsand as js
 from jaxsand import envs
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
+from jaxsand.planning.binary import make_problem
 
 from .env_cases import KEY, one_map, program
 
@@ -64,7 +65,7 @@ def test_random_walks_are_maps_of_one_piece():
     sizes = []
     for dig, start in zip(np.asarray(pool.dig), np.asarray(pool.starts), strict=True):
         assert dig[tuple(start)]
-        js.planner.make_problem(dig, tuple(start.tolist()))  # raises if it falls into pieces
+        make_problem(dig, tuple(start.tolist()))  # raises if it falls into pieces
         sizes.append(dig.sum())
     assert min(sizes) >= 2
     assert max(sizes) <= 21

@@ -154,7 +154,7 @@ def _far(width: Any, thickness: Any) -> Any:
     return ((width + 1) ** 2 + (thickness + 1) ** 2) ** 0.5 / 2 + 1
 
 
-_TOLERANCE = 2e-4  # spacings by which sand may move at the edge of a window: what it changes inside is up to 20 times that
+_TOLERANCE = 1e-3  # as settling leaves it by default: slopes above repose, and spacings by which sand may move at an edge
 _LEAST = 1.5  # times a window's width: the map's, for the window to save work
 
 

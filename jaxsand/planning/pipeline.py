@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import pairwise
 from typing import Any, Literal
@@ -24,6 +24,7 @@ from jaxsand.relaxation.settling import settle, steepest_slope
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
+from jaxsand.scene.window import Whole
 
 Kind = Literal["map", "glyph", "image", "heights", "terrain"]
 Tell = Callable[[str], None]
@@ -244,8 +245,12 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
 
 @cache
 def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]], float]:
-    """`follow_frames` for paths of a given number of points, compiled ahead, and the seconds that took."""
+    """`follow_frames` for paths of a given number of points, compiled ahead, and the seconds that took.
+
+    On the whole map: the heap of a path of many legs outgrows any window that the blade's size tells.
+    """
     began = time.perf_counter()
+    scene = replace(scene, window=Whole())
     height = jax.ShapeDtypeStruct(scene.grid.shape, np.float32)
     path = jax.ShapeDtypeStruct((points, 2), np.float32)
     program: Callable[..., Any] = jax.jit(partial(follow_frames, scene)).lower(height, path).compile()
