@@ -137,8 +137,8 @@ def test_bad_input_is_one_line_and_exit_code_2(here, capsys, name):
     assert sorted(here.iterdir()) == before
 
 
-def run(*arguments, **options):
-    environment = os.environ | {"PYTHONWARNINGS": "error"}
+def run(*arguments, environment=None, **options):
+    environment = os.environ | {"PYTHONWARNINGS": "error"} | (environment or {})
     return subprocess.run(
         [sys.executable, "-m", "jaxsand", *arguments],
         capture_output=True,
@@ -305,8 +305,7 @@ def test_pictures_do_not_depend_on_the_users_matplotlib(tmp_path):
     of_the_user = {"MPLBACKEND": "module://none.here", "MATPLOTLIBRC": str(tmp_path / "matplotlibrc")}
     pictures = []
     for environment in ({}, of_the_user):
-        command = [sys.executable, "-m", "jaxsand", "plan", "map.txt", "--out", "."]
-        done = subprocess.run(command, cwd=tmp_path, env=os.environ | environment, check=False, capture_output=True)
-        assert done.returncode == 0, done.stderr.decode()
+        done = run("plan", "map.txt", "--out", ".", cwd=tmp_path, environment=environment)
+        assert done.returncode == 0, done.stderr
         pictures.append((tmp_path / "plan-map.png").read_bytes())
     assert pictures[0] == pictures[1]

@@ -103,7 +103,8 @@ def read_heights(path: str | Path) -> np.ndarray:
         with Path(path).open("rb") as file:
             if file.read(6) != b"\x93NUMPY":
                 raise ValueError("it does not begin as one")
-        heights = np.load(path, allow_pickle=False)
+            file.seek(0)
+            heights = np.load(file, allow_pickle=False)
     except Exception as error:  # a spoilt header may raise anything, from a tokenizer's errors to a lack of memory
         raise ValueError(f"{path}: cannot be read as a .npy array ({_reason(error)}); save one with numpy.save") from None
     if not isinstance(heights, np.ndarray) or heights.ndim != 2 or not heights.size:

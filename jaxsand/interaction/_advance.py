@@ -117,13 +117,7 @@ class Advance(Step):
 
     def block_of(self, way: Way, frame: Frame, k: jax.Array) -> tuple[First, First]:
         """Where the block of step k begins, and by how much that has moved."""
-        old, new = self.block.corners(frame, *(self._middle(way, j) for j in (jnp.maximum(k - 1, 0), k)))
-        return new, (new[0] - old[0], new[1] - old[1])
-
-    def _middle(self, way: Way, k: jax.Array) -> jax.Array:
-        """How far ahead the tool is halfway through step k."""
-        steps = jnp.maximum(k - int(self.lowered), 0).astype(way.length.dtype)
-        return jnp.minimum((steps + 0.5) * (self.chunk * self.substep), way.length)
+        return self.block.ahead(frame, way.length, k - int(self.lowered), self.chunk * self.substep)
 
     def felt(self, way: Way, k: jax.Array, first: First, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The share of each cell that the blade covers at any time in step k, and the rate at which sand flows then."""
@@ -158,7 +152,7 @@ class Advance(Step):
         h, lost = self.block.displaced(way, view, shares, h, taken)
         around = self.block.around(view, reach)
         sand = self.block.sand(way, view, clear, around)
-        guess = self.block.guess(around, jnp.where(moving, part, 0), flux)
+        guess = self.block.guess(around.gates, jnp.where(moving, part, 0), flux)
         return Ready(around, sand, rate * part, h, guess), lost
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:

@@ -105,17 +105,19 @@ class Block:
         begin = [jnp.floor(lax.stop_gradient(centre)).astype(jnp.int32) - behind for centre in (x, y)]
         return begin[0], begin[1]
 
-    def corners(self, frame: Frame, before: jax.Array, after: jax.Array) -> tuple[First, First]:
-        """The first cells of the blocks around where the tool is after two ways ahead.
+    def ahead(self, frame: Frame, length: jax.Array, step: jax.Array, stride: float) -> tuple[First, First]:
+        """Where the block begins around the middle of a step of `stride` spacings along a leg, and by how much that has
+        moved since the step before.
 
-        The two are computed as one array. As two expressions a compiler may join products and sums in one and not in the
-        other, and what is `after` now is `before` a step later: where a centre is on the border of two cells, once in a
-        hundred thousand strokes, the block would have been elsewhere than remembered.
+        The two places are computed as one array. As two expressions a compiler may join products and sums in one and not in
+        the other, and what is the new place now is the old one a step later: where a middle is on the border of two cells,
+        once in a hundred thousand strokes, the block would have been elsewhere than remembered.
         """
-        pose, ways = jax.tree.map(lax.stop_gradient, (frame.pose, jnp.stack([before, after])))
-        firsts = self.corner(pose.x + ways * pose.cos, pose.y + ways * pose.sin)
-        x, y = lax.optimization_barrier(firsts)
-        return (x[0], y[0]), (x[1], y[1])
+        steps = jnp.maximum(jnp.stack([step - 1, step]), 0).astype(length.dtype)
+        ways = jnp.minimum((steps.reshape(2, *(1,) * length.ndim) + 0.5) * stride, length)
+        pose, ways = jax.tree.map(lax.stop_gradient, (frame.pose, ways))
+        x, y = lax.optimization_barrier(self.corner(pose.x + ways * pose.cos, pose.y + ways * pose.sin))
+        return (x[1], y[1]), (x[1] - x[0], y[1] - y[0])
 
     def coordinates(self, frame: Frame, first: First) -> tuple[jax.Array, jax.Array]:
         """How far ahead of a pose, and to its left, the cells that are near it, and a halo, lie (spacings)."""
@@ -198,13 +200,13 @@ class Block:
         bottom = way.bottom / way.quantum
         return Sand(stand.gates, stand.open, stand.stretch, bottom, view.drop, view.sides, rim, self.neighbours)
 
-    def guess(self, near: Stand, part: jax.Array, flux: Fluxes) -> Fluxes:
-        """A part of the last fluxes, as far as links are open."""
-        whole = tuple(nearest(f * part) for f in flux)
-        if self.drains:
-            whole = (*whole[:-1], jnp.zeros_like(whole[-1]))
-        there = where_open(self.neighbours, near.gates, tuple(self.part(f) for f in whole))
-        return tuple(self.put(f, g) for f, g in zip(whole, there, strict=True))
+    def guess(self, gates: Fluxes, part: jax.Array, flux: Fluxes) -> Fluxes:
+        """A part of the last fluxes, as far as links are open, `gates` of those near the tool; none of what ran off over a
+        rim, which would not come back."""
+        links = tuple(nearest(f * part) for f in flux[: len(flux) - int(self.drains)])
+        there = where_open(self.neighbours, gates, tuple(self.part(f) for f in links))
+        over = (jnp.zeros_like(f) for f in flux[len(links) :])
+        return (*(self.put(f, g) for f, g in zip(links, there, strict=True)), *over)
 
     def over(self, way: Way, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array] | None:
         """What lies beyond a rim near the blade, and which part of the sand above its bottom stands above the rim."""

@@ -12,11 +12,11 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import Step
-from jaxsand.interaction._block import First, Moving, View, pose_ahead
+from jaxsand.interaction._block import Moving, View, pose_ahead
 from jaxsand.interaction._frame import Frame, frame_of, shifted
 from jaxsand.interaction._turning import rotated
 from jaxsand.interaction._wheel import Stand, Track
-from jaxsand.interaction.resting import bring_to_rest, where_open
+from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.tools import Pose
@@ -82,7 +82,7 @@ class _Moved(Step):
         """The sand once what was taken up has left the wheel, which then stands there, and all was brought to rest."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
         around, among = wheel.around(self.block, track, view, now, h)
-        guess = where_open(around.neighbours, around.gates, tuple(f * (among * part) for f in flux))
+        guess = self.block.guess(around.gates, among * part, flux)
         h, flux = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
         return h, flux, None if gone is None else gone + flux[-1]
 
@@ -134,9 +134,9 @@ class Roll(_Moved):
     def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
         way, block = track.way, self.block
         frame = frame_of(block.shape, way.start)
-        last, first = (self._first(track, frame, j) for j in (jnp.maximum(k - 1, 0), k))
+        first, by = block.ahead(frame, way.length, k - int(self.lowered), self.chunk * self.substep)
         view, old = block.view(way, frame, first, sand.height)
-        flux = shifted(sand.flux, (first[0] - last[0], first[1] - last[1])) if block.follows else sand.flux
+        flux = shifted(sand.flux, by) if block.follows else sand.flux
         gone = None if view.beyond is None else jnp.zeros_like(old)
 
         def substep(i: jax.Array, state: Sanded) -> Sanded:
@@ -161,13 +161,6 @@ class Roll(_Moved):
         cover = jnp.maximum(*(wheel.stand(block, track, f, first).cover for f in ends))
         edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, new, cover))
         return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
-
-    def _first(self, track: Track, frame: Frame, k: jax.Array) -> First:
-        """Where the block of step k begins."""
-        steps = jnp.maximum(k - int(self.lowered), 0).astype(track.way.length.dtype)
-        middle = (steps + 0.5) * (self.chunk * self.substep)
-        pose = pose_ahead(frame, jnp.minimum(middle, track.way.length))
-        return self.block.corner(pose.x, pose.y)
 
     def _poses(self, track: Track, frame: Frame, k: jax.Array, i: jax.Array) -> tuple[tuple[Frame, Frame], jax.Array]:
         """The wheel before and after sub-step i of step k, and the way between (spacings)."""

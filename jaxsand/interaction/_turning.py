@@ -51,7 +51,7 @@ class Turn(Step):
         h, lost = self.block.displaced(way, view, blade.any_way(face * pose.cos, face * pose.sin), old, taken)
         near = self.block.around(view, reach)
         around = self.block.sand(way, view, self.block.clear(view), near)
-        guess = self.block.guess(near, part, sand.flux)
+        guess = self.block.guess(near.gates, part, sand.flux)
         new, flux = self.rest(around, way.rate * among * part, self.sweeps, h, guess)
         gone = None if lost is None else lost + flux[-1]
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))

@@ -138,14 +138,22 @@ def with_near(scene: Scene) -> Scene:
     """The scene, whose window says how much of it is near its blade, if the blade's size is known."""
     if not (isinstance(scene.window, Window) and isinstance(scene.tool, Blade)):
         return scene
-    parts = [concrete(x) for x in (scene.tool.width, scene.tool.thickness, scene.grid.spacing)]
-    if any(x is None or x.ndim for x in parts):
+    known = _known(scene.tool.width, scene.tool.thickness, scene.grid.spacing)
+    if known is None:
         return scene
-    width, thickness, dx = (float(x) for x in parts if x is not None)
+    width, thickness, dx = known
     far = _far(width / dx, thickness / dx)
     if not far < max(scene.grid.shape):
         return scene
     return replace(scene, window=replace(scene.window, near=2 * math.floor(far) + 3))
+
+
+def _known(*leaves: Any) -> list[float] | None:
+    """Numbers of one scene, unless one of them is traced or belongs to many scenes."""
+    found = [concrete(x) for x in leaves]
+    if any(x is None or x.ndim for x in found):
+        return None
+    return [float(x) for x in found if x is not None]
 
 
 def _far(width: Any, thickness: Any) -> Any:
@@ -163,11 +171,11 @@ def windows_for(scene: Scene, push: Any, times: float = 1) -> Iterator[Scene]:
     as the one before, as long as that saves work; sand that reaches a window's edge asks for the next."""
     if not (isinstance(scene.window, AsNeeded) and isinstance(scene.tool, Blade) and isinstance(push, SteppedPush)):
         return
-    parts = [concrete(x) for x in (scene.tool.width, scene.tool.thickness, scene.tool.depth, scene.grid.spacing)]
+    known = _known(scene.tool.width, scene.tool.thickness, scene.tool.depth, scene.grid.spacing)
     angle = concrete(scene.material.repose_angle)
-    if angle is None or any(x is None or x.ndim for x in parts):
+    if angle is None or known is None:
         return
-    width, thickness, depth, dx = (float(x) for x in parts if x is not None)
+    width, thickness, depth, dx = known
     heap = math.sqrt(width * max(depth, dx / 2) / math.tan(float(np.min(angle))))
     spread = 2 if scene.grid.neighbours == "isotropic" else 0  # whose gradients reach farther
     cells = times * (math.hypot(width, thickness) + 3.3 * heap) / dx + 2 * SPARE + spread

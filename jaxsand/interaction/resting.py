@@ -179,13 +179,11 @@ def _weight(gate: jax.Array) -> jax.Array:
 
 
 def where_open(neighbours: Neighbours, gates: Fluxes, guess: Fluxes) -> Fluxes:
-    """A guess as far as links are open, in whole quanta; none of what runs off over a rim, which would not come back."""
+    """A guess of what crosses links as far as they are open, in whole quanta."""
     if neighbours == "isotropic":
         across, up = _both_ends(list(gates))
         gates = tuple(ends[k] for n in range(4) for ends, k in ((across, n // 2), (up, n % 2)))
-    over = tuple(jnp.zeros_like(f) for f in guess[len(gates) :])
-    there = zip(gates, guess, strict=False)
-    return (*(nearest(jnp.where(g < _GUESSED, g / _GUESSED, 1) * f) for g, f in there), *over)
+    return tuple(nearest(jnp.where(g < _GUESSED, g / _GUESSED, 1) * f) for g, f in zip(gates, guess, strict=True))
 
 
 def _over(sand: Sand, rate: jax.Array, y: jax.Array, s: jax.Array) -> jax.Array:

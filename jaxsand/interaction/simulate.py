@@ -221,11 +221,12 @@ def ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple
         check_whole("push.sweeps", push.sweeps, 0)
         check_rate(scene, "push.rate", push.rate)
     scheme, stop = check_rule(scene, scheme, stop)
-    fitted, height = fit(with_near(scene), height)
+    scene = with_near(scene)
+    fitted, height = fit(scene, height)
     if isinstance(
         fitted.grid.spacing, jax.core.Tracer
     ):  # under jit: what is cast to the height's dtype is no number any more
-        fitted, _ = fit(next(windows_for(scene, push, _SURE), with_near(scene)), height)
+        fitted, _ = fit(next(windows_for(scene, push, _SURE), scene), height)
     return fitted, height, cast((push, scheme, stop), height.dtype)
 
 

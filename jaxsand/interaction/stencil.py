@@ -39,11 +39,6 @@ def net(neighbours: Neighbours, flux: Fluxes) -> jax.Array:
     return _linear(lambda f: received(neighbours, f), lambda y: tuple(-d for d in _steps(neighbours, y)), tuple(flux))
 
 
-def neighbour(x: jax.Array, di: int, dj: int) -> jax.Array:
-    """What each cell sees (di, dj) cells further, at most one; 0 beyond the map."""
-    return _linear(lambda x: at(halo(x, 0.0), di, dj), lambda y: at(halo(y, 0.0), -di, -dj), x)
-
-
 def seen(u: jax.Array, di: int, dj: int) -> jax.Array:
     """What each inner cell of a map with halo sees (di, dj) cells further, at most one."""
     return _linear(lambda u: at(u, di, dj), lambda y: _placed(y, (1 + di, 1 - di), (1 + dj, 1 - dj)), u)
