@@ -8,6 +8,7 @@ from PIL import Image
 
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
+from jaxsand.goals import surfaces
 
 
 def test_letters():
@@ -89,7 +90,7 @@ def test_height_files(tmp_path):
 
 
 def test_terrain():
-    land = goals.terrain()
+    land = surfaces.terrain()
     assert land.shape == (344, 403)
     assert 200 < land.min() < land.max() < 1100
 

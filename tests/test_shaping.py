@@ -7,6 +7,7 @@ import pytest
 
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
+from jaxsand.goals import surfaces
 from jaxsand.goals.metrics import volume_error
 from jaxsand.planning import pipeline as shaping
 
@@ -63,7 +64,7 @@ def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
 def test_a_rough_surface_is_settled_first():
     dig, start = goals.letter_map("L")
     target = shaping.map_target(dig, start, "L", shaping.Layout())
-    land = shaping.terrain_surface(target.scene.grid.shape, 0.006)
+    land = surfaces.terrain_surface(target.scene.grid.shape, 0.006)
     assert np.ptp(land) == pytest.approx(0.006)
     result = shape(target, land)
     assert result.figures["iou"] > 0.5
@@ -73,7 +74,7 @@ def test_a_rough_surface_is_settled_first():
 
 def test_terrain_as_a_goal():
     layout = shaping.Layout(depth=0.0075)
-    result = shape(shaping.height_target(shaping.terrain_surface((48, 48), 0.03), "terrain", "terrain", layout))
+    result = shape(shaping.height_target(surfaces.terrain_surface((48, 48), 0.03), "terrain", "terrain", layout))
     assert not result.target.drawn
     assert result.figures["l2_reduction"] == result.figures["l2_reduction_with_berms"]
     assert result.figures["iou"] > 0.3

@@ -1,7 +1,6 @@
 """How many glyphs a learner gets right: by itself, by looking ahead with the simulator, and after polish by gradients."""
 
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,15 +10,14 @@ from jaxsand.goals import metrics as task
 from jaxsand.goals.layout import right, strict, strokes_right
 from jaxsand.planning.learned.beam_search import Proposes
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.viz.strokes import found_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Tell = Callable[[str], None]
 
-
-def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = lambda _: None) -> dict[str, Any]:
+def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = quiet) -> dict[str, Any]:
     """As many pushes as each glyph has strokes, judged at the end; see `jaxsand.success`."""
     began = time.perf_counter()
     rows = {}

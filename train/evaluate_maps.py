@@ -6,7 +6,7 @@ fewest steps are the planner's from there, proven. Looking ahead is another stag
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from string import ascii_uppercase
 from typing import Any
@@ -20,6 +20,7 @@ from jaxsand.envs.maps import STEPS, MapPool, map_pool
 from jaxsand.envs.onmap import MapParams, OnMap
 from jaxsand.goals import letters as goals
 from jaxsand.planning.binary import Cell, plan
+from jaxsand.scene.progress import Tell, quiet
 from train.qnet import Greedy, best, of
 
 MOST = 3
@@ -31,7 +32,7 @@ def evaluate(
     state: Any,
     maps: Mapping[str, tuple[np.ndarray, Cell | None]] | None = None,
     width: int = 0,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = quiet,
 ) -> dict[str, Any]:
     """How many maps are `solved`, and how many in the fewest steps (`optimal`).
 

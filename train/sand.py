@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from jaxsand.bench.stroke_goals import CELLS, SPACING
+from jaxsand.goals.surfaces import rough_surface
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -26,9 +26,7 @@ def starts(scene: Scene, rng: np.random.Generator, count: int, rough: float) -> 
     some = rng.random(count) < rough
     if not some.any():
         return maps
-    noise = [
-        gaussian_filter(rng.standard_normal(scene.grid.shape), np.exp(rng.uniform(*np.log(_FEATURES)))) for _ in maps[some]
-    ]
-    surface = np.stack([rng.uniform(0, _RELIEF) * (n - n.mean()) / np.ptp(n) for n in noise]).astype(np.float32)
-    maps[some] = np.asarray(settle_batch(scene, surface).height)
+    drawn = [(rng.uniform(0, _RELIEF), np.exp(rng.uniform(*np.log(_FEATURES)))) for _ in maps[some]]
+    surface = np.stack([rough_surface(rng, scene.grid.shape, relief, scale) for relief, scale in drawn])
+    maps[some] = np.asarray(settle_batch(scene, surface.astype(np.float32)).height)
     return maps

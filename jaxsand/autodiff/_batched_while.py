@@ -4,7 +4,8 @@ The step's number is one number, not one for each map, and the tape that reverse
 
 A step may say that it computes a batch by itself (`Step.trailing`): then `vmap` moves the batch to the last axis of all
 arrays, the vector unit's lanes, where it stays for the whole loop, and on a CPU takes no more maps at a time than a core's
-cache holds. Such a step leaves a map that is ready as it is, and its `done` speaks for all maps at once.
+cache holds, those of like `work` together. Such a step leaves a map that is ready as it is, and its `done` speaks for all
+maps at once.
 """
 
 from collections.abc import Callable
@@ -123,7 +124,10 @@ def batched(program: Callable[..., Any], loop: Lanes, params: Tree, *rest: Tree)
 
 
 def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[Any], args: Tree) -> Tree:
-    """`program` with one more batch in the last axis, chunk by chunk; the result gains the axis in front."""
+    """`program` with one more batch in the last axis, chunk by chunk; the result gains the axis in front.
+
+    A chunk takes as many steps as its longest map, so maps are sorted by their work.
+    """
     leaves, tree = jax.tree.flatten(args)
     yes = jax.tree.leaves(mapped)
     chunk = min(size, loop.step.together)
@@ -151,10 +155,15 @@ def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[
     if chunks == 1:
         return some(batch)
     extra = chunks * chunk - size
-    if extra:
-        batch = [jnp.concatenate([x, jnp.broadcast_to(x[-1:], (extra, *x.shape[1:]))]) for x in batch]
-    out = lax.map(some, [x.reshape(chunks, chunk, *x.shape[1:]) for x in batch])
-    return jax.tree.map(lambda x: x.reshape(chunks * chunk, *x.shape[2:])[:size], out)
+    order = place = jnp.arange(size)
+    if loop.done is not None:
+        axes = jax.tree.map(lambda y: 0 if y else None, mapped[0])
+        work = jax.vmap(loop.step.work, in_axes=(axes,), axis_size=size)(args[0])
+        order = jnp.argsort(jnp.max(work.reshape(size, -1), axis=1))
+        place = jnp.argsort(order)
+    order = jnp.concatenate([order, jnp.broadcast_to(order[-1:], (extra,))])
+    out = lax.map(some, [x[order].reshape(chunks, chunk, *x.shape[1:]) for x in batch])
+    return jax.tree.map(lambda x: x.reshape(chunks * chunk, *x.shape[2:])[place], out)
 
 
 def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:

@@ -3,8 +3,7 @@ moves could save."""
 
 import math
 import os
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.bench.rivals.plain import settle_numpy
+from jaxsand.bench.timing import race, seconds_of
 from jaxsand.bench.work_precision import COLUMN, RIDGE, distance, trench
 from jaxsand.relaxation.flux import Nothing
 from jaxsand.relaxation.ghost_cells import at, halo, largest, prepare, quantum
@@ -21,9 +21,9 @@ from jaxsand.relaxation.schemes import Relaxation
 from jaxsand.relaxation.settling import relax, settle, settle_batch
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.relaxation.sweep import Flow, sweep
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 
-Tell = Callable[[str], None]
 _ANGLE = math.radians(29)
 _BOUND = 4000
 _RATES = (0.04, 0.06, 0.08, 0.1, 0.125, 1 / 6.83, 0.16, 0.18, 0.2, 1 / 4.83, 0.22, 0.25)
@@ -91,7 +91,7 @@ def activity(n: int = 160, sweeps: int = 1000) -> dict[str, Any]:
     }
 
 
-def chunks(scene: Scene, heights: jax.Array, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+def chunks(scene: Scene, heights: jax.Array, tell: Tell = quiet) -> list[dict[str, Any]]:
     """Maps a second of `settle_batch` by the size of a chunk, called from one thread and from one for each core, and with a
     tall column in one map of every 256 (`with_slow`; `sweeps` is then the largest number of sweeps, and the mean)."""
     high, wide = heights.shape[1:]
@@ -103,7 +103,7 @@ def chunks(scene: Scene, heights: jax.Array, tell: Tell = lambda _: None) -> lis
         many = len(heights)
 
         def rate(maps: jax.Array, chunk: int = chunk) -> float:
-            return len(maps) / _best(lambda: settle_batch(scene, maps, chunk=chunk).height)
+            return len(maps) / race({"": partial(settle_batch, scene, maps, chunk=chunk)}, 5)[""].best
 
         row = {"name": f"chunks of {chunk}", "maps_per_second": rate(heights), "with_slow": rate(slow)}
         with _one_core():
@@ -129,18 +129,7 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, here)
 
 
-def _best(run: Callable[[], Any], turns: int = 5) -> float:
-    """Seconds of the best of a few turns after a first."""
-    jax.block_until_ready(run())
-    best = math.inf
-    for _ in range(turns):
-        began = time.perf_counter()
-        jax.block_until_ready(run())
-        best = min(best, time.perf_counter() - began)
-    return best
-
-
-def peer(batch: int = 256, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+def peer(batch: int = 256, tell: Tell = quiet) -> list[dict[str, Any]]:
     """60 x 30 cells of 10 mm, a block of 20 x 10 cells and 40 mm, 30 degrees: the case on which an open-source sand-shaping
     gym reports 671 iterations and 0.33 s in numpy."""
     tell("the peer's case")
@@ -150,21 +139,19 @@ def peer(batch: int = 256, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
     with jax.enable_x64(True):
         exact = settle(scene, jnp.asarray(h, jnp.float64), scheme=Relaxation(1 / 64), stop=UntilStill(1e-6, 400_000, 64))
         end = np.asarray(exact.height)
-    began = time.perf_counter()
-    plain, sweeps = settle_numpy(h, 0.01, math.tan(math.radians(30)))
-    seconds = time.perf_counter() - began
+    seconds, (plain, sweeps) = seconds_of(partial(settle_numpy, h, 0.01, math.tan(math.radians(30))))
     rows: list[dict[str, Any]] = [
         {"name": "numpy, paper's sweep", "sweeps": sweeps, "seconds": seconds, "error": distance(plain, end, h)}
     ]
     maps = jnp.broadcast_to(jnp.asarray(h), (batch, 60, 30))
     for name, scheme in (("settle_batch, paper's sweep", Relaxation()), ("settle_batch", None)):
-        settled = settle_batch(scene, maps, scheme=scheme)
-        best = _best(partial(settle_batch, scene, maps, scheme=scheme)) / batch
+        timed = race({name: partial(settle_batch, scene, maps, scheme=scheme)}, 5)[name]
+        settled = timed.result
         rows.append(
             {
                 "name": name,
                 "sweeps": int(settled.sweeps[0]),
-                "seconds": best,
+                "seconds": timed.best / batch,
                 "error": distance(np.asarray(settled.height[0], float), end, h),
             }
         )

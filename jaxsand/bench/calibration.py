@@ -2,16 +2,17 @@
 can have, and of a cone that is known exactly, beside the error that is stated."""
 
 import math
-import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.timing import seconds_of
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.simulate import Push, step
 from jaxsand.relaxation.settling import settle
 from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.terramechanics.calibration import Trial, calibrate
@@ -20,7 +21,6 @@ from jaxsand.terramechanics.finer import OneGrid, TwoGrids
 NOISE = 6e-4
 """Standard deviation (m) of the white noise in the heights after."""
 
-Tell = Callable[[str], None]
 _SHAPE, _SPACING = (32, 32), 0.01
 _STROKE = np.array([0.08, 0.12, 0.24, 0.2], np.float32)
 _LEVEL = np.zeros(_SHAPE, np.float32)
@@ -30,7 +30,7 @@ _PARTS = 16  # of a cell's side, for means over cells
 _FREE = ("repose_angle",)
 
 
-def bench_calibrate(tell: Tell = lambda _: None, seeds: int = 50) -> list[dict[str, Any]]:
+def bench_calibrate(tell: Tell = quiet, seeds: int = 50) -> list[dict[str, Any]]:
     """For three experiments in the simulator's own sand: the rms and the largest error of the angle of repose, and the rms
     of the noise's standard errors (at the optimum the Cramer-Rao bound), in degrees, over so many angles and noises.
     Strokes are swaths: the fast push."""
@@ -60,7 +60,7 @@ def bench_calibrate(tell: Tell = lambda _: None, seeds: int = 50) -> list[dict[s
     return rows
 
 
-def bench_cone(tell: Tell = lambda _: None, seeds: int = 100) -> list[dict[str, Any]]:
+def bench_cone(tell: Tell = quiet, seeds: int = 100) -> list[dict[str, Any]]:
     """For every neighbourhood, over so many noises on the exact cone of 29 degrees: the mean angle that best explains it,
     and the mean of the noise's, the grid's and the whole stated standard error (degrees); in which share of the trials the
     cone's angle lies within two of the noise's, and within two of the whole; the same of `sand`, the estimate without the
@@ -119,11 +119,7 @@ def _told(scene: Scene, trial: Trial) -> list[float]:
 
 def _seconds(scene: Scene, trials: list[Trial], grid: TwoGrids | OneGrid) -> float:
     """The median time of a call, the first one left out."""
-    times = []
-    for trial in trials:
-        start = time.perf_counter()
-        calibrate(scene, trial, free=_FREE, grid=grid)
-        times.append(time.perf_counter() - start)
+    times = [seconds_of(partial(calibrate, scene, trial, free=_FREE, grid=grid))[0] for trial in trials]
     return float(np.median(times[1:] or times))
 
 

@@ -5,16 +5,17 @@ The counterpart of "order of complexity" in arXiv:1908.02745, and the maps that 
 
 import string
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.timing import race, seconds_of
 from jaxsand.goals import letters as goals
 from jaxsand.planning.binary import Cell, Plan, plan
 from jaxsand.planning.binary.paper import ALPHA
+from jaxsand.scene.progress import Tell
 
-Tell = Callable[[str], None]
 PUBLISHED = {
     ("A", 7.2): (18_532, 23),
     ("S", 7.2): (788_492, 27),
@@ -121,9 +122,7 @@ def rows_of_paper(tell: Tell) -> list[dict[str, Any]]:
     for (letter, alpha), (nodes, steps) in PUBLISHED.items():
         tell(f"the paper's search: {letter}, alpha {alpha}")
         dig, start = goals.letter_map(letter)
-        began = time.perf_counter()
-        found = plan(dig, start, engine="paper", weight=ALPHA / alpha)
-        seconds = time.perf_counter() - began
+        seconds, found = seconds_of(partial(plan, dig, start, engine="paper", weight=ALPHA / alpha))
         ours, ms = _timed(dig, start, "astar")
         rows.append(
             {
@@ -211,9 +210,5 @@ def rows_of_hard(tell: Tell, seconds: float = 10.0) -> list[dict[str, Any]]:
 
 
 def _timed(dig: np.ndarray, start: Cell | None, engine: Any) -> tuple[Plan, float]:
-    best = float("inf")
-    for _ in range(3):
-        began = time.perf_counter()
-        found = plan(dig, start, engine=engine)
-        best = min(best, time.perf_counter() - began)
-    return found, best * 1e3
+    timed = race({"plan": partial(plan, dig, start, engine=engine)}, 2)["plan"]
+    return timed.result, 1e3 * min(timed.first, timed.best)

@@ -4,10 +4,9 @@ Actions are random, over the whole map of 32 x 32 cells where they are strokes; 
 the time.
 """
 
-import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,14 +15,15 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from jaxsand.bench.timing import race
 from jaxsand.envs import LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.planning.stroke_loss import pushed
 from jaxsand.relaxation.batching import wide_vectors
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.window import Whole
 
-Tell = Callable[[str], None]
 Row = dict[str, Any]
 _FULL, _FAST, _MAP, _SAND = KINDS = "full push", "fast push", "walk on a map", "walk on sand"
 _VMAP, _SHARED, _LOOP = "vmap", ", a share to each device", "Gymnasium, one by one"
@@ -46,7 +46,7 @@ class Contender:
     call: Callable[[], Any]
 
 
-def bench_env(batch: int = 1024, tell: Tell = lambda _: None, kinds: tuple[str, ...] = KINDS) -> list[Row]:
+def bench_env(batch: int = 1024, tell: Tell = quiet, kinds: tuple[str, ...] = KINDS) -> list[Row]:
     """Steps a second of each way, the best of a few rounds in turns, and how many times those of Gymnasium's single
     environment of its kind that is. Compile time is the first call less a later one; `reset_us` what a reset costs in a
     batch (microseconds); `error_percent` how far pushes that are settled less well end from those that are still."""
@@ -160,37 +160,22 @@ def _gymnasium(kind: str, options: dict[str, Any]) -> list[Contender]:
 
 
 def _raced(ways: list[Contender], tell: Tell) -> list[Row]:
-    first: dict[Contender, float] = {}
-    best = dict.fromkeys(ways, math.inf)
-    for k in range(_ROUNDS + 1):
-        for way in ways:
-            tell(f"{way.kind}, {way.name}: {f'round {k} of {_ROUNDS}' if k else 'first call'}")
-            began = time.perf_counter()
-            jax.block_until_ready(way.call())
-            seconds = time.perf_counter() - began
-            if k:
-                best[way] = min(best[way], seconds)
-            else:
-                first[way] = seconds
+    timed = race({f"{way.kind}, {way.name}": way.call for way in ways}, _ROUNDS, tell)
     return [
         {
             "kind": way.kind,
             "name": way.name,
             "batch": way.batch,
-            "steps_per_second": way.steps / best[way],
-            "seconds": best[way],
-            "compile_seconds": max(0.0, first[way] - best[way]),
+            "steps_per_second": way.steps / took.best,
+            "seconds": took.best,
+            "compile_seconds": took.compile_seconds,
         }
-        for way in ways
+        for way, took in zip(ways, timed.values(), strict=True)
     ]
 
 
 def _reset_seconds(env: Any, params: Any, batch: int) -> float:
     """Of one environment in a batch."""
     reset = jax.jit(jax.vmap(env.reset, (0, None)))
-    keys, best = jax.random.split(jax.random.key(3), batch), math.inf
-    for _ in range(_ROUNDS + 1):
-        began = time.perf_counter()
-        jax.block_until_ready(reset(keys, params))
-        best = min(best, time.perf_counter() - began)
-    return best / batch
+    keys = jax.random.split(jax.random.key(3), batch)
+    return race({"reset": partial(reset, keys, params)}, _ROUNDS)["reset"].best / batch

@@ -1,14 +1,13 @@
 """States that A* expands a second: whole layers at once (planner/frontier.py) beside a plain heap, in one run."""
 
-import gc
 import heapq
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.timing import race
 from jaxsand.goals.letters import letter_map
 from jaxsand.planning.binary.frontier import Bound, layered, misdug, two_colours
 from jaxsand.planning.binary.graph import Graph, goal_only, with_margin
@@ -32,9 +31,10 @@ def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[di
     rows = []
     for name, graph, bound in problems:
         tell(f"whole layers and a heap: {name}")
-        first, seconds, found = _median(partial(layered, graph, bound), repeats)
+        layers = race({name: partial(layered, graph, bound)}, repeats)[name]
         heap = heap_misdug if bound is misdug else heap_two_colours
-        _, heap_seconds, (steps, expanded) = _median(partial(heap, graph), 3)
+        queue = race({name: partial(heap, graph)}, 3)[name]
+        seconds, heap_seconds, found, (steps, expanded) = layers.median, queue.median, layers.result, queue.result
         if found.steps != steps:
             raise RuntimeError(f"{name}: {found.steps} steps by layers, {steps} by the heap")
         rows.append(
@@ -49,21 +49,10 @@ def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[di
                 "heap_per_second": expanded / heap_seconds,
                 "times_the_rate": found.expanded / seconds * heap_seconds / expanded,
                 "times_as_fast": heap_seconds / seconds,
-                "compile_seconds": max(0.0, first - seconds),
+                "compile_seconds": layers.compile_seconds,
             }
         )
     return rows
-
-
-def _median(run: Callable[[], Any], repeats: int) -> tuple[float, float, Any]:
-    """Seconds of the first run, the median of the later ones, and the result."""
-    times, result = [], None
-    for _ in range(1 + repeats):
-        gc.collect()
-        began = time.perf_counter()
-        result = run()
-        times.append(time.perf_counter() - began)
-    return times[0], float(np.median(times[1:])), result
 
 
 def heap_misdug(graph: Graph) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -21,14 +22,15 @@ from jaxsand.bench.gradient_checks import (
     relative,
     sloped,
 )
+from jaxsand.bench.timing import race
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
 from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window
 
-Tell = Callable[[str], None]
 Row = dict[str, Any]
 STOPS: tuple[Stop, ...] = (*(UntilStill(t) for t in (0.1, 0.03, 0.01, 1e-3, 1e-4)), *(Sweeps(n) for n in (16, 64, 256)))
 _ROUNDS = 3
@@ -41,7 +43,7 @@ CASES = (
 
 
 def bench_grad(
-    tell: Tell = lambda _: None,
+    tell: Tell = quiet,
     larger: int | None = None,
     cases: tuple[Case, ...] = CASES,
     stops: tuple[Stop, ...] = STOPS,
@@ -76,7 +78,7 @@ def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...
             x = cast(given, jnp.float32)
             run = program(case, cells)
             forward, gradient = _compiled(_together(run, together), x), _compiled(_together(sloped(run), together), x)
-            best = _race([lambda f=forward, x=x: f[0](*x), lambda f=gradient, x=x: f[0](*x)], rounds)
+            timed = race({"forward": partial(forward[0], *x), "gradient": partial(gradient[0], *x)}, rounds)
             taken, allowed = _sweeps(case, cells, given[1], int(jnp.max(forward[0](*x)[1])))
             more = (gradient[2] - forward[2]) / (together * cells**2)
             rows.append(
@@ -85,9 +87,9 @@ def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...
                     "cells": cells,
                     "batch": batch,
                     "together": together,
-                    "forward_seconds": best[0],
-                    "gradient_seconds": best[1],
-                    "gradient_over_forward": best[1] / best[0],
+                    "forward_seconds": timed["forward"].best,
+                    "gradient_seconds": timed["gradient"].best,
+                    "gradient_over_forward": timed["gradient"].best / timed["forward"].best,
                     "forward_compile_seconds": forward[1],
                     "gradient_compile_seconds": gradient[1],
                     "sweeps": taken,
@@ -109,17 +111,6 @@ def _compiled(run: Callable[..., Any], x: Inputs) -> tuple[Any, float, int]:
     began = time.perf_counter()
     compiled = jax.jit(run).lower(*x).compile()
     return compiled, time.perf_counter() - began, getattr(compiled.memory_analysis(), "temp_size_in_bytes", 0)
-
-
-def _race(ways: list[Callable[..., Any]], rounds: int) -> list[float]:
-    """Best time of each, in turns, after a first call."""
-    best = [math.inf] * len(ways)
-    for turn in range(rounds + 1):
-        for k, way in enumerate(ways):
-            began = time.perf_counter()
-            jax.block_until_ready(way())
-            best[k] = min(best[k], time.perf_counter() - began) if turn else math.inf
-    return best
 
 
 def _sweeps(case: Case, cells: int, strokes: np.ndarray, settling: int) -> tuple[int, int]:
@@ -170,15 +161,15 @@ def stopped_early(
             tell(f"stopped early: {case.name}, {name}")
             gradient, forward = _stopping(run, stop, x)
             (_, sweeps), found = gradient()
-            best = _race([forward, gradient], rounds)
+            timed = race({"forward": forward, "gradient": gradient}, rounds)
             error = relative(found, limit)
             rows.append(
                 {
                     "name": case.name,
                     "stop": name,
                     "sweeps": float(np.mean(sweeps)),
-                    "forward_seconds": best[0],
-                    "gradient_seconds": best[1],
+                    "forward_seconds": timed["forward"].best,
+                    "gradient_seconds": timed["gradient"].best,
                     "error_median": float(np.median(error)),
                     "error_largest": float(error.max()),
                 }

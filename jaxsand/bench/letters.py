@@ -1,16 +1,14 @@
 """Every letter, shaped: how close the sand comes to it."""
 
 import string
-from collections.abc import Callable
 from typing import Any
 
 from jaxsand.goals import letters as goals
 from jaxsand.planning.pipeline import Layout, glyph_target, map_target, shape
+from jaxsand.scene.progress import Tell, quiet
 
-Tell = Callable[[str], None]
 
-
-def bench_letters(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+def bench_letters(tell: Tell = quiet) -> list[dict[str, Any]]:
     """Every letter by the plan of its map, and by its own strokes.
 
     A letter pushed by its own strokes is its own goal, so that row checks the plumbing.

@@ -1,7 +1,6 @@
 """Piles that are known exactly, and how close the sand comes to them."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,9 +12,9 @@ from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.boundaries import Draining
 from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import make_scene
 
-Tell = Callable[[str], None]
 ANGLE = math.radians(29)
 
 
@@ -77,7 +76,7 @@ def table(n: int, neighbours: Neighbours = "isotropic") -> float:
     return float(np.abs(np.asarray(s.height) - exact).sum() / exact.sum())
 
 
-def piles(tell: Tell = lambda _: None, sizes: int = 4) -> list[dict[str, Any]]:
+def piles(tell: Tell = quiet, sizes: int = 4) -> list[dict[str, Any]]:
     """L1 errors against exact piles by the number of cells a side, and the order in which they fall, in float64; for a cone
     also the least and the largest angle of its flank (degrees, repose is 29)."""
     rows: list[dict[str, Any]] = []

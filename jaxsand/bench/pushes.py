@@ -8,7 +8,6 @@ repose.
 """
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -19,24 +18,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.interaction.batched import step_batch, value_and_grad_batch
+from jaxsand.bench.timing import race
+from jaxsand.goals.surfaces import rough_surface
+from jaxsand.interaction.batched import act_batch, step_batch, value_and_grad_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.blade_stepped import SteppedPush, push_along, with_near
 from jaxsand.interaction.resting import Sand, no_flux
-from jaxsand.interaction.simulate import follow_frames, step
+from jaxsand.interaction.simulate import follow, follow_frames, step
 from jaxsand.interaction.stencil import net, steps
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import truncate
 from jaxsand.relaxation.settling import settle, settle_batch
 from jaxsand.scene.grid import links
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, cast, fit, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window
 
-Tell = Callable[[str], None]
 _ANGLE = math.radians(29)
 _STILL = 1e-4  # a slope (a tangent) at which the limit's sand counts as at rest
-_ROUNDS = 3
 _WAYS = tuple(
     SteppedPush(1 / a, n)
     for a, n in (
@@ -71,9 +71,7 @@ def surfaces(scene: Scene, batch: int) -> dict[str, np.ndarray]:
     dx = float(scene.grid.spacing)
     across = [0.25 * columns * dx, 0.5 * rows * dx, 0.75 * columns * dx, 0.5 * rows * dx]
     trenched = np.asarray(step(scene, level[0], np.array(across)).height)
-    waves = np.random.default_rng(0).normal(size=(batch, 6, 6))
-    rough = np.asarray(jax.image.resize(jnp.asarray(waves), (batch, rows, columns), "cubic"))
-    rough = 0.01 * rough / (rough.max((1, 2)) - rough.min((1, 2)))[:, None, None]
+    rough = rough_surface(np.random.default_rng(0), (batch, rows, columns), 0.01, 3)
     return {
         "level": level,
         "trenched": np.repeat(trenched[None], batch, 0),
@@ -81,7 +79,7 @@ def surfaces(scene: Scene, batch: int) -> dict[str, np.ndarray]:
     }
 
 
-def push_precision(batch: int = 16, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+def push_precision(batch: int = 16, tell: Tell = quiet) -> list[dict[str, Any]]:
     """Random pushes of the default blade on 32 x 32 cells, by sub-step and sweeps, on `surfaces`.
 
     `error` is the mean distance from the limit over the mean change that the limit makes, after settling; `worst` the same
@@ -117,7 +115,7 @@ def push_precision(batch: int = 16, tell: Tell = lambda _: None) -> list[dict[st
     return [row | {"fitted_order": order} for row in rows]
 
 
-def push_speed(batch: int, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+def push_speed(batch: int, tell: Tell = quiet) -> list[dict[str, Any]]:
     """Random pushes of the default blade on level sand of 32 x 32 cells: pushes a second, the ways taking turns."""
     scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
     level, strokes = jnp.zeros((batch, 32, 32), jnp.float32), random_strokes(batch)
@@ -135,26 +133,17 @@ def push_speed(batch: int, tell: Tell = lambda _: None) -> list[dict[str, Any]]:
     part = max(1, batch // 4)
     ways["value_and_grad_batch"] = (part, partial(value_and_grad_batch, scene, _square, level[:part], strokes[:part]))
     ways["vmap(step)"] = (batch, lambda: vmapped(level, strokes))
+    pulled = jax.jit(jax.vmap(jax.grad(lambda h, s: _square(step(scene, h, s).height), argnums=(0, 1))))
+    ways["vmap(grad(step))"] = (part, lambda: pulled(level[:part], strokes[:part]))
     ways["step, one map at a time"] = (len(few), lambda: [step(scene, level[0], s) for s in few])
-    first, best = {}, dict.fromkeys(ways, math.inf)
-    for turn in range(_ROUNDS + 1):
-        for name, (_, run) in ways.items():
-            tell(f"{name}, turn {turn}")
-            began = time.perf_counter()
-            jax.block_until_ready(run())
-            seconds = time.perf_counter() - began
-            if turn:
-                best[name] = min(best[name], seconds)
-            else:
-                first[name] = seconds
     return [
         {
             "name": name,
-            "pushes_per_second": many / best[name],
-            "seconds": best[name],
-            "compile_seconds": max(0.0, first[name] - best[name]),
+            "pushes_per_second": ways[name][0] / timed.best,
+            "seconds": timed.best,
+            "compile_seconds": timed.compile_seconds,
         }
-        for name, (many, _) in ways.items()
+        for name, timed in race({name: run for name, (_, run) in ways.items()}, tell=tell).items()
     ]
 
 
@@ -162,7 +151,7 @@ def _square(height: jax.Array) -> jax.Array:
     return jnp.sum(height**2)
 
 
-def push_against_spacing(tell: Tell = lambda _: None, batch: int = 8) -> list[dict[str, Any]]:
+def push_against_spacing(tell: Tell = quiet, batch: int = 8) -> list[dict[str, Any]]:
     """The same pushes of a blade of 60 x 30 mm, 20 mm deep, on finer grids, averaged over the cells of the coarsest, against
     the finest; with the fitted order."""
     maps = {}
@@ -178,7 +167,7 @@ def push_against_spacing(tell: Tell = lambda _: None, batch: int = 8) -> list[di
     return [{"cells": n, "error": e, "fitted_order": order} for n, e in zip(sides, errors, strict=True)]
 
 
-def push_by_heading(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+def push_by_heading(tell: Tell = quiet) -> list[dict[str, Any]]:
     """One stroke of 12 cm from 0 to 45 degrees on isotropic level sand, each the mean of eight sub-cell places: the heap's
     height before the blade is lifted and the volume dug in the end, as shares of their means over the headings."""
     rows = []
@@ -200,8 +189,48 @@ def push_by_heading(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
     return rows
 
 
+def push_continuity(many: int = 1024, tell: Tell = quiet) -> list[dict[str, Any]]:
+    """How far what a stroke leaves moves with the stroke: the largest change of a height over that of the stroke, as
+    quantiles over random strokes in float64."""
+    with jax.enable_x64(True):
+        scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
+        strokes = np.asarray(random_strokes(many), float)
+        moves = np.random.default_rng(0).normal(size=strokes.shape)
+        moves /= np.abs(moves).max(1, keepdims=True)
+        level, rows = np.zeros((many, 32, 32)), []
+
+        def after(strokes: np.ndarray) -> np.ndarray:
+            return np.asarray(act_batch(scene, level, strokes).height)
+
+        tell("continuity: strokes")
+        before = after(strokes)
+        for cells in (1e-2, 1e-3, 1e-4):
+            tell(f"continuity: strokes moved by {cells:g} cells")
+            by = cells * 0.01
+            change = np.abs(after(strokes + by * moves) - before).max((1, 2)) / by
+            quantiles = {f"p{100 * q:g}": float(np.quantile(change, q)) for q in (0.5, 0.9, 0.99)}
+            rows.append({"moved_cells": cells, **quantiles, "largest": float(change.max())})
+    return rows
+
+
+def long_path(sides: tuple[int, ...] = (64, 4096), legs: int = 100, tell: Tell = quiet) -> list[dict[str, Any]]:
+    """A path of many short legs in the middle of maps of any size, beside one copy of the map."""
+    rows = []
+    for n in sides:
+        tell(f"a path of {legs} legs on {n} x {n} cells")
+        scene, level = make_scene((n, n), 0.01, _ANGLE, tool=Blade()), np.zeros((n, n), np.float32)
+        steps = np.random.default_rng(0).uniform(-0.02, 0.02, (legs + 1, 2))
+        path = (n * 0.005 + np.clip(np.cumsum(steps, 0), -0.2, 0.2)).astype(np.float32)
+        ways: dict[str, Callable[[], Any]] = {
+            "seconds": partial(follow, scene, level, path),
+            "copy_seconds": partial(np.add, level, 1),
+        }
+        rows.append({"cells": n, "legs": legs} | {name: timed.best for name, timed in race(ways).items()})
+    return rows
+
+
 def heaps(
-    spacings_mm: tuple[float, ...] = (10, 5, 2.5, 1.25), push: SteppedPush | None = None, tell: Tell = lambda _: None
+    spacings_mm: tuple[float, ...] = (10, 5, 2.5, 1.25), push: SteppedPush | None = None, tell: Tell = quiet
 ) -> list[dict[str, Any]]:
     """The heap ahead of a blade as wide as its bed, against the triangle: 20 mm thick, 12 mm deep, 16 cm far, 31 degrees.
 

@@ -7,7 +7,6 @@ call less a later one.
 import math
 import os
 import platform
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -30,15 +29,16 @@ from jaxsand.bench import work_precision as workprec
 from jaxsand.bench.letters import bench_letters
 from jaxsand.bench.rivals.plain import compile_c, settle_numpy
 from jaxsand.bench.tables import as_table
+from jaxsand.bench.timing import race
 from jaxsand.interaction.simulate import act
 from jaxsand.relaxation.batching import cores
 from jaxsand.relaxation.schemes import Relaxation, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 
-Tell = Callable[[str], None]
 _CELLS = 32
 _SPACING = 0.01
 _ANGLE = math.radians(29)
@@ -50,7 +50,7 @@ _C = "C loop, one core"
 def bench(
     what: str,
     batch: int | None = None,
-    tell: Tell = lambda _: None,
+    tell: Tell = quiet,
     grids: int = 3,
     seed: int = 0,
     **strokes: Any,
@@ -83,6 +83,8 @@ def bench(
             report["push_heaps"] = pushbench.heaps(tell=tell)
             report["push_by_spacing"] = pushbench.push_against_spacing(tell)
             report["push_by_heading"] = pushbench.push_by_heading(tell)
+            report["push_continuity"] = pushbench.push_continuity(tell=tell)
+            report["push_long_path"] = pushbench.long_path(tell=tell)
     if what in ("plan", "all"):
         report |= complexity.planning(tell)
         report["expansions"] = expansions.rows_of_expansions(tell)
@@ -118,7 +120,7 @@ class Way:
     cores: int = 1
 
 
-def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixed: int = 64) -> list[dict[str, Any]]:
+def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 64) -> list[dict[str, Any]]:
     """Settling maps in which a random push has just ended.
 
     `error` is the largest distance, over the first maps, of the settled map from the limit of small steps (float64, rate
@@ -172,8 +174,8 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
     limit = np.stack([small(h.astype(float), _SPACING, mu)[0] for h in host[:sample]])
     largest = np.abs(limit - host[:sample]).max()
     rows = []
-    for name, (seconds, first, (sweeps, maps)) in _race(ways, tell).items():
-        way = ways[name]
+    for name, timed in race({name: way.call for name, way in ways.items()}, tell=tell).items():
+        way, seconds, (sweeps, maps) = ways[name], timed.best, timed.result
         work = float(np.sum(np.broadcast_to(sweeps, (way.maps,)))) * _CELLS**2
         rows.append(
             {
@@ -184,7 +186,7 @@ def bench_settle(batch: int, tell: Tell = lambda _: None, sample: int = 16, fixe
                 "core_ns_per_cell_sweep": seconds * way.cores / work * 1e9,
                 "sweeps": float(np.mean(sweeps)),
                 "seconds": seconds,
-                "compile_seconds": max(0.0, first - seconds),
+                "compile_seconds": timed.compile_seconds,
             }
         )
     _compare(rows, _NUMPY, "maps_per_second", "times_numpy")
@@ -199,23 +201,6 @@ def table(report: dict[str, Any]) -> str:
         if isinstance(rows, list) and rows and what not in ("map", "work_precision", "strokes_curves"):
             lines += ["", *as_table(rows, what.replace("_", " "))]
     return "\n".join(lines)
-
-
-def _race(ways: dict[str, Way], tell: Tell) -> dict[str, tuple[float, float, Any]]:
-    """Best time, first time and result of each way, in turns."""
-    first, best, result = {}, dict.fromkeys(ways, math.inf), {}
-    for name, way in ways.items():
-        tell(f"first call: {name}")
-        began = time.perf_counter()
-        result[name] = jax.block_until_ready(way.call())
-        first[name] = time.perf_counter() - began
-    for turn in range(_ROUNDS):
-        for name, way in ways.items():
-            tell(f"round {turn + 1} of {_ROUNDS}: {name}")
-            began = time.perf_counter()
-            jax.block_until_ready(way.call())
-            best[name] = min(best[name], time.perf_counter() - began)
-    return {name: (best[name], first[name], result[name]) for name in ways}
 
 
 def _compare(rows: list[dict[str, Any]], rival: str, figure: str, name: str, *, inverse: bool = False) -> None:

@@ -9,13 +9,13 @@ import jax
 import numpy as np
 
 from jaxsand.bench.rivals import search as rivals
+from jaxsand.bench.timing import race
 from jaxsand.interaction.simulate import step
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Job, Lattice, Steps, propose
 from jaxsand.planning.search.rollouts import distance, pushed, replay, roughly_pushed
 from jaxsand.planning.search.tasks import SAND_TASKS, SandTask, sand_task
-
-Tell = Callable[[str], None]
+from jaxsand.scene.progress import Tell, quiet
 
 _STROKES: dict[str, Callable[..., Any]] = {
     "binary plan": rivals.binary,
@@ -34,7 +34,7 @@ _SEARCH, _ALONE = "search", "layers alone"
 
 
 def bench_sand(
-    tell: Tell = lambda _: None, per_stroke: int = 1000, names: tuple[str, ...] = (), seed: int = 0
+    tell: Tell = quiet, per_stroke: int = 1000, names: tuple[str, ...] = (), seed: int = 0
 ) -> list[dict[str, Any]]:
     """Every method on every task, at `per_stroke` full pushes to each stroke or leg that a plan may have.
 
@@ -64,7 +64,8 @@ def children_per_second(batch: int = 256, alone: int = 32, seed: int = 0) -> lis
         "batch": (lambda: pushed(scene, maps, ways), batch),
         "batch, rough": (lambda: roughly_pushed(scene, maps, ways), batch),
     }
-    rate = {name: count / _best_time(run) for name, (run, count) in runs.items()}
+    timed = race({name: run for name, (run, _) in runs.items()})
+    rate = {name: count / timed[name].best for name, (_, count) in runs.items()}
     base, full = rate["one at a time"], rate["batch"]
     return [
         {"name": name, "children_per_second": value, "times_one_at_a_time": value / base, "cost": full / value}
@@ -106,12 +107,3 @@ def _on_task(chosen: SandTask, tell: Tell, per_stroke: int, seed: int) -> list[d
         }
         for name, (paths, effort, after, seconds) in ends.items()
     ]
-
-
-def _best_time(run: Callable[[], Any], rounds: int = 4) -> float:
-    times = []
-    for _ in range(rounds):  # the first compiles
-        began = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - began)
-    return min(times[1:])

@@ -17,10 +17,10 @@ from jaxsand.relaxation.settling import Settled, settle, settle_batch, steepest_
 from jaxsand.relaxation.stopping import Outcome, UntilStill
 from jaxsand.scene.boundaries import Draining, Walls
 from jaxsand.scene.grid import Neighbours, links
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
 
-Tell = Callable[[str], None]
 VOLUME = {"float16": 2e-3, "float32": 1e-6, "float64": 1e-12}  # the largest volume error
 QUANTA = 64  # sand that the floats stop is steeper by at most so many quanta to a spacing
 OVERSHOOT = 0.02  # of the first range, for super-time-stepping; other schemes may not leave it at all
@@ -113,7 +113,7 @@ def _structures(base: Case) -> Iterator[Case]:
 
 
 def stability(
-    largest: int = 1024, pushes: int = 100_000, tell: Tell = lambda _: None, only: Callable[[Case], bool] = lambda _: True
+    largest: int = 1024, pushes: int = 100_000, tell: Tell = quiet, only: Callable[[Case], bool] = lambda _: True
 ) -> list[dict[str, Any]]:
     """One row for each case and dtype, and one for `pushes` random pushes in a row (none for 0). `only` picks cases.
 

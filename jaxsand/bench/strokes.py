@@ -15,8 +15,8 @@ from jaxsand.planning.gradient import first, print_of, search
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import reordered
 from jaxsand.planning.stroke_loss import Best, SandLoss
+from jaxsand.scene.progress import Tell, quiet
 
-Tell = Callable[[str], None]
 Row = dict[str, Any]
 Method = Callable[[SandLoss, int, np.ndarray, int, int], Found]
 BUDGETS = (1_000, 4_000, 16_000, 64_000)
@@ -67,7 +67,7 @@ def run_all(
     budgets: tuple[int, ...] = BUDGETS,
     seeds: tuple[int, ...] = (0,),
     out: Path | None = None,
-    tell: Tell = lambda _: None,
+    tell: Tell = quiet,
 ) -> list[Row]:
     """A row for every method, goal and seed: one run at the largest budget, with what it had at each of the others.
 
@@ -144,7 +144,7 @@ def at_budget(rows: list[Row], budget: int) -> list[tuple[Row, Row]]:
 
 
 def bench_strokes(
-    tell: Tell = lambda _: None,
+    tell: Tell = quiet,
     goals: str = "letters",
     calls: int = 4_000,
     seeds: tuple[int, ...] = (0,),

@@ -1,25 +1,25 @@
 """What the wheel's trenches cost: their error against run time over the spacing, and the sweeps until one is still."""
 
 import math
-import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.timing import race
 from jaxsand.interaction.simulate import act
 from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation.schemes import Multilevel, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
 from jaxsand.terramechanics.trench_experiment import FIGURES, RULES, TRENCHES, errors, references, simulate_all
 from jaxsand.terramechanics.wheel_trench import trimmed
 
-Tell = Callable[[str], None]
 SPACINGS = (4e-3, 2e-3, 1e-3, 5e-4)
 _SOME = tuple(trench for trench in TRENCHES if trench[1] == 15)
 _SCHEMES: dict[str, Scheme] = {
@@ -31,7 +31,7 @@ _SCHEMES: dict[str, Scheme] = {
 }
 
 
-def against_spacing(tell: Tell = lambda _: None, spacings: int = 4) -> list[dict[str, Any]]:
+def against_spacing(tell: Tell = quiet, spacings: int = 4) -> list[dict[str, Any]]:
     """For every rule, reference and spacing the mean figures of the five trenches of 15 mm, and the median seconds of one
     (compiled, on one of the cores). `finest` are the same rule's sections on the finest spacing."""
     known = references(_SOME)
@@ -50,7 +50,7 @@ def against_spacing(tell: Tell = lambda _: None, spacings: int = 4) -> list[dict
     return rows
 
 
-def settling(tell: Tell = lambda _: None, turns: int = 5) -> list[dict[str, Any]]:
+def settling(tell: Tell = quiet, turns: int = 5) -> list[dict[str, Any]]:
     """The paper's case of 160 x 160 cells: a trench before the sand flows (22.5 degrees, 15 mm, cells of 2 mm) is left to
     settle. `error` is the largest distance from the limit of small steps over the largest change of height."""
     spacing, cells = 2e-3, 160
@@ -73,14 +73,10 @@ def settling(tell: Tell = lambda _: None, turns: int = 5) -> list[dict[str, Any]
         for tolerance in (0.1, 0.03, 0.01, 1e-3):
             tell(f"settling 160 x 160, {name}, tolerance {tolerance:g}")
             stop = UntilStill(tolerance)
-            settled = jax.block_until_ready(settle(bed, start, scheme=scheme, stop=stop))
-            best = math.inf
-            for _ in range(turns):
-                began = time.perf_counter()
-                jax.block_until_ready(settle(bed, start, scheme=scheme, stop=stop))
-                best = min(best, time.perf_counter() - began)
+            timed = race({name: partial(settle, bed, start, scheme=scheme, stop=stop)}, turns)[name]
+            settled = timed.result
             error = float(np.abs(np.asarray(settled.height, float) - limit).max() / largest)
             rows.append(
-                {"name": name, "tolerance": tolerance, "sweeps": int(settled.sweeps), "seconds": best, "error": error}
+                {"name": name, "tolerance": tolerance, "sweeps": int(settled.sweeps), "seconds": timed.best, "error": error}
             )
     return rows

@@ -21,9 +21,9 @@ from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.boundaries import Draining
 from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 
-Tell = Callable[[str], None]
 MU = math.tan(math.radians(29))
 _PAPER = "paper's sweep, k = dx^2/8"
 SCHEMES: dict[str, Scheme] = {
@@ -103,7 +103,7 @@ RIDGE = Problem("ridge, one dimension", _ridge, (64, 128, 256), exact=_ridge_set
 ALL = (*STIFF, ISOTROPIC, TABLE, RIDGE)
 
 
-def work_precision(problems: tuple[Problem, ...], tell: Tell = lambda _: None, sizes: int = 3) -> list[dict[str, Any]]:
+def work_precision(problems: tuple[Problem, ...], tell: Tell = quiet, sizes: int = 3) -> list[dict[str, Any]]:
     """A row for every problem, size, scheme and tolerance: errors, sweeps, seconds, and the compile time apart."""
     rows = []
     for problem in problems:
@@ -142,7 +142,7 @@ def reference(problem: Problem, n: int) -> np.ndarray:
         return np.asarray(settle(problem.scene(n), start, scheme=SuperTimeStepping(0.05, 1 / 64), stop=stop).height)
 
 
-def reference_check(tell: Tell = lambda _: None) -> list[dict[str, Any]]:
+def reference_check(tell: Tell = quiet) -> list[dict[str, Any]]:
     """How far the reference lies from the paper's sweep at rate 1/64, on the smallest grid of every stiff problem."""
     rows = []
     for problem in STIFF:

@@ -150,6 +150,7 @@ def _summary(report: dict[str, Any]) -> str:
 
 def _target(options: argparse.Namespace) -> "Target":
     from jaxsand.goals import letters as goals
+    from jaxsand.goals import surfaces
     from jaxsand.planning import pipeline as shaping
 
     name, method = options.goal, options.method
@@ -181,7 +182,7 @@ def _target(options: argparse.Namespace) -> "Target":
         return shaping.height_target(goals.read_heights(existing(path)), "heights", path.stem, _layout(options, 7.5))
     if name == "terrain":
         layout = _layout(options, 7.5)
-        land = shaping.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
+        land = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
         return shaping.height_target(land, "terrain", name, layout)
     raise ValueError(
         f"goal: got {name!r}; give a letter A to Z, a .txt, .png or .npy file, or terrain, "
@@ -212,14 +213,14 @@ def _cells(options: argparse.Namespace) -> int:
 
 def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | None":
     from jaxsand.goals import letters as goals
-    from jaxsand.planning import pipeline as shaping
+    from jaxsand.goals import surfaces
 
     if options.surface == "level":
         return None
     if options.surface == "terrain":
         if not (math.isfinite(options.relief_mm) and options.relief_mm >= 0):
             raise ValueError(f"relief-mm: got {options.relief_mm}; give the terrain's height range, 0 or more")
-        return shaping.terrain_surface(target.scene.grid.shape, options.relief_mm / 1e3)
+        return surfaces.terrain_surface(target.scene.grid.shape, options.relief_mm / 1e3)
     if not options.surface.endswith(".npy"):
         raise ValueError(f"surface: got {options.surface!r}; give level, terrain or a .npy file")
     heights = goals.read_heights(existing(Path(options.surface)))

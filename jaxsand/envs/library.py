@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from jaxsand.envs.multi import LevelGoals, MultiStroke, RoughGoals
 from jaxsand.envs.pushing import Pushing
 from jaxsand.goals import metrics as task
 from jaxsand.goals.letters import stroke_list
+from jaxsand.goals.surfaces import rough_surface
 from jaxsand.interaction.simulate import check
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill
@@ -102,10 +102,8 @@ def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Ge
         return np.zeros(shape, np.float32)
     if not (0 <= starts.relief < np.inf and 0 < starts.scale < np.inf):
         raise ValueError(f"starts: got {starts}; give a relief of 0 m or more, and a scale above 0 cells")
-    noise = gaussian_filter(rng.normal(size=shape), (0, starts.scale, starts.scale), mode="reflect")
-    noise -= noise.mean((1, 2), keepdims=True)
-    noise *= starts.relief / np.ptp(noise, axis=(1, 2), keepdims=True)
-    rested = settle_batch(scene, noise.astype(np.float32), stop=UntilStill(bound=200_000))
+    rough = rough_surface(rng, shape, starts.relief, starts.scale)
+    rested = settle_batch(scene, rough.astype(np.float32), stop=UntilStill(bound=200_000))
     check(rested)
     return np.asarray(rested.height)
 

@@ -117,18 +117,6 @@ def read_heights(path: str | Path) -> np.ndarray:
     return heights.astype(heights.dtype.newbyteorder("="))
 
 
-def terrain() -> np.ndarray:
-    """Real terrain: elevations (m) around the Jacksboro fault, 344 x 403 cells, row 0 in the south.
-
-    The digital elevation model that matplotlib ships as a sample (USGS data).
-    """
-    from matplotlib.cbook import get_sample_data
-
-    data: Any = get_sample_data("jacksboro_fault_dem.npz")
-    with data:
-        return np.flipud(np.array(data["elevation"], dtype=float))
-
-
 def text_strokes(text: str) -> np.ndarray:
     """The strokes [n, 4] of any text, y up, in Hershey's single-stroke Roman font.
 

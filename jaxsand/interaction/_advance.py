@@ -57,6 +57,10 @@ class Step:
     def together(self) -> int:
         return self.block.together
 
+    def work(self, way: Way) -> jax.Array:
+        """How far the step leads: what its number of repetitions grows with."""
+        return way.length + jnp.abs(way.angle)
+
     def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
         raise NotImplementedError
 

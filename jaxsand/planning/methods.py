@@ -8,9 +8,10 @@ import numpy as np
 from jaxsand.planning.gradient import Optimised, optimise_strokes
 from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Planned, Stages, plan_by_policy
-from jaxsand.planning.pipeline import Target, Tell, at_rest
+from jaxsand.planning.pipeline import Target, at_rest
 from jaxsand.planning.search import SandPlan, plan_sand
 from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.scene.progress import Tell
 
 
 def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: int, seed: int, tell: Tell) -> Target:

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
 from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import Shaped, act, check, follow_frames
@@ -22,12 +21,12 @@ from jaxsand.planning.learned.stages import Planned
 from jaxsand.planning.search import SandPlan
 from jaxsand.relaxation.settling import settle, steepest_slope
 from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Whole
 
 Kind = Literal["map", "glyph", "image", "heights", "terrain"]
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -176,13 +175,7 @@ def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> 
     return height_target(goal, "image", name, layout)
 
 
-def terrain_surface(shape: tuple[int, int], relief: float) -> np.ndarray:
-    """The terrain sample at another shape, around height 0, `relief` (m) from its lowest to its highest point."""
-    land = task.resample(goals.terrain(), shape)
-    return (land - np.median(land)) / (land.max() - land.min()) * relief
-
-
-def shape(target: Target, before: np.ndarray | None = None, tell: Tell = lambda _: None) -> ShapeResult:
+def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) -> ShapeResult:
     """Pushes a target's strokes on `before` [H, W] (m; level sand at 0 if None), which is settled first.
 
     Raises:

@@ -6,7 +6,7 @@ compared with the closed form and with the exact relaxation (wheel_trench.py), a
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -20,13 +20,13 @@ from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import Push, check, step
 from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation.batching import cores
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Wheel
 from jaxsand.scene.window import Window
 from jaxsand.terramechanics.scans import Scan, compare, measured_profile
 from jaxsand.terramechanics.wheel_trench import Pass, Profile, closed_form, relaxed
 
-Tell = Callable[[str], None]
 Trench = tuple[float, float]  # slip angle (degrees), sinkage (mm)
 ANGLES = (0.0, 22.5, 45.0, 67.5, 90.0)
 SINKAGES = (5.0, 15.0, 25.0)
@@ -80,7 +80,7 @@ def simulate(trench: Trench, spacing: float, push: Push) -> Rut:
     return Rut(half, float(np.abs(half.z - earlier.z).mean()), seconds)
 
 
-def simulate_all(trenches: Iterable[Trench], spacing: float, push: Push, tell: Tell = lambda _: None) -> dict[Trench, Rut]:
+def simulate_all(trenches: Iterable[Trench], spacing: float, push: Push, tell: Tell = quiet) -> dict[Trench, Rut]:
     """`simulate` for many trenches, on all cores."""
     trenches = list(trenches)
 
@@ -148,7 +148,7 @@ def experiment(
     spacing: float = 2e-3,
     rules: Iterable[str] = tuple(RULES),
     scans: dict[Trench, list[Scan]] | None = None,
-    tell: Tell = lambda _: None,
+    tell: Tell = quiet,
 ) -> tuple[dict[str, Any], dict[str, dict[Trench, Profile]]]:
     """The table of all fifteen trenches, and the profiles by their source (a rule or a reference).
 

@@ -6,7 +6,6 @@ due, L-BFGS, until the goal is reached or the budget is spent.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -18,6 +17,7 @@ from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses
 from jaxsand.planning.stroke_loss import Best, SandLoss, pushed
 from jaxsand.relaxation.stopping import check_whole
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, as_array, blade_of
 
 _LANES = 4  # plans that go downhill together
@@ -62,7 +62,7 @@ def optimise_strokes(
     most: int = 8,
     smoothing: Blurred | None = Blurred(),
     guess: jax.typing.ArrayLike | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = quiet,
 ) -> Optimised:
     """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
 

@@ -1,12 +1,12 @@
 """What the optimiser has spent and found: every stroke pushed on a map is a call, every gradient as many as it costs."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from jaxsand.planning.stroke_loss import GRADIENT, Best, SandLoss
+from jaxsand.scene.progress import Tell, quiet
 
 
 @dataclass
@@ -15,7 +15,7 @@ class Account:
 
     sand: SandLoss
     budget: int
-    tell: Callable[[str], None] = lambda _: None
+    tell: Tell = quiet
     calls: int = 0
     history: list[Best] = field(default_factory=list)
 

@@ -1,13 +1,13 @@
 """Looking ahead with the simulator as a model: what a policy proposes is tried on the sand, the best plans go on, and the
 closest is put right."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from jaxsand.planning.stroke_loss import SandLoss, pushed
+from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene
 
 _ASIDE = (0.25, 0.1)  # cells: so far the numbers of a plan are moved, to see what that does
@@ -42,9 +42,7 @@ def one_after_the_other(
     return np.stack(plans, 1), np.stack(maps)
 
 
-def look_ahead(
-    policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, tell: Callable[[str], None] = lambda _: None
-) -> Ahead:
+def look_ahead(policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, tell: Tell = quiet) -> Ahead:
     """A beam search: `width` proposals for each of as many plans are pushed, and the `width` closest plans go on whose maps
     differ. Of all plans up to `strokes` long the closest is put right: none if no stroke brings the sand closer.
 

@@ -1,6 +1,5 @@
 """From a policy to a plan: by itself, or looking ahead with the simulator, then by gradients; each stage can be left out."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.learned.beam_search import Proposes, look_ahead, one_after_the_other
 from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.scene.progress import Tell, quiet
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def plan_by_policy(
     sand: SandLoss,
     strokes: int,
     stages: Stages = Stages(),
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = quiet,
 ) -> Planned:
     """At most so many strokes towards the goal.
 

@@ -6,8 +6,9 @@ from functools import cache
 
 import numpy as np
 
-from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics as task
+from jaxsand.goals import surfaces
+from jaxsand.goals.surfaces import rough_surface
 from jaxsand.interaction.simulate import check
 from jaxsand.planning.search.actions import Actions, Lattice, Steps
 from jaxsand.planning.search.rollouts import replay
@@ -79,16 +80,12 @@ def _pit() -> SandTask:
 
 def _rough() -> SandTask:
     """A rough surface: level."""
-    rough = np.random.default_rng(5).normal(size=_SHAPE)
-    for _ in range(8):
-        p = np.pad(rough, 1, mode="edge")
-        rough = (2 * p[1:-1, 1:-1] + p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 6
-    return _levelling("rough surface", 0.012 * rough / np.abs(rough).max(), 12)
+    return _levelling("rough surface", rough_surface(np.random.default_rng(5), _SHAPE, 0.022, 1.6), 12)
 
 
 def _terrain() -> SandTask:
     """A patch of real terrain, of 3 cm relief: level."""
-    land = task.resample(goals.terrain()[100:200, 100:200], _SHAPE)
+    land = task.resample(surfaces.terrain()[100:200, 100:200], _SHAPE)
     return _levelling("terrain", 0.03 * (land - np.median(land)) / (land.max() - land.min()), 12)
 
 
