@@ -41,7 +41,7 @@ def run_training(options: argparse.Namespace) -> None:
         minutes = MINUTES[options.learner]
     name = "ddpg-paper" if options.paper else options.learner
     out = options.out or Path("runs") / f"{name}-{options.seed}"
-    from train.runs import run
+    from train.runs.runs import run
 
     with _watch(out, options.tensorboard) as watch:
         ran = run(learner, out, options.seed, minutes=minutes, steps=steps, resume=options.resume, tell=tell, watch=watch)
@@ -64,7 +64,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
 
         report = _on_sand(load_policy(), options, tell, out)
     else:
-        from train.runs import learner_of, load
+        from train.runs.runs import learner_of, load
 
         learner: Any = learner_of(Path(options.run))
         state = load(Path(options.run), learner)
@@ -79,8 +79,8 @@ def run_evaluation(options: argparse.Namespace) -> None:
 def run_shipping(options: argparse.Namespace) -> None:
     """Writes a run's best policy where jaxsand looks for it, with how it was made."""
     from jaxsand.planning.learned.policy import save_policy
-    from train.hindsight import Hindsight
-    from train.runs import about_run, learner_of, load, seed_of
+    from train.imitation.hindsight import Hindsight
+    from train.runs.runs import about_run, learner_of, load, seed_of
 
     learner = learner_of(options.run)
     if not isinstance(learner, Hindsight):
@@ -113,14 +113,14 @@ def _learner(options: argparse.Namespace) -> tuple[Any, int | None]:
 
 def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
     if options.learner == "hindsight":
-        from train.hindsight import Hindsight
+        from train.imitation.hindsight import Hindsight
 
         return Hindsight(), None
     if options.learner == "dqn":
-        from train.dqn import Dqn
+        from train.dqn.learner import Dqn
 
         return Dqn(), None
-    from train.ddpg import Ddpg
+    from train.ddpg.learner import Ddpg
 
     paper = Ddpg.paper()
     return (paper, None if options.minutes else paper.chunks(EPISODES)) if options.paper else (Ddpg(), None)
@@ -128,8 +128,8 @@ def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
 
 def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None) -> dict[str, Any]:
     from jaxsand.planning.learned.stages import Stages
-    from train.evaluate import evaluate, picture
-    from train.glyphs import SETS, read_glyphs
+    from train.evaluation.glyphs import SETS, read_glyphs
+    from train.evaluation.scores import evaluate, picture
 
     if options.goals is not None and options.goals not in SETS:
         raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(SETS)}")
@@ -151,7 +151,7 @@ def _on_maps(
     for option in ("glyphs", "goals", "refine"):
         if getattr(options, option):
             raise ValueError(f"{option}: has an effect on strokes only, and dqn walks over maps; leave it out")
-    from train.evaluate_maps import evaluate
+    from train.dqn.walks import evaluate
 
     report: dict[str, Any] = evaluate(learner, state, width=options.lookahead or 0, tell=tell)
     if out:

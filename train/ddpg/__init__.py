@@ -1,0 +1,1 @@
+"""DDPG with hindsight experience replay: the learner, its networks and its tasks."""

@@ -1,0 +1,73 @@
+"""How an actor and its critic act: by themselves, or proposing strokes to whoever looks ahead with the simulator."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.bench.stroke_goals import CELLS
+from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
+from jaxsand.scene.scene import Scene, blade_of
+from train.ddpg.networks import Actor, Critic
+
+_TRIED = 16  # actions for each one that is asked for
+_SEED = 0  # of how they differ from the actor's, the same at every look
+
+
+@dataclass(frozen=True)
+class Acts:
+    """An `actor` and a `critic` with their parameters. With more than one stroke asked for, the actor's own action and
+    others about it, by normal noise of standard deviation `noise`, are ranked by the critic."""
+
+    actor: Actor
+    critic: Critic
+    of_actor: Any
+    of_critic: Any
+    noise: float
+
+    def act(self, observation: Any) -> jax.Array:
+        """The actor's actions [B, A] for observations [B, ...]."""
+        return _act(self.actor, self.of_actor, observation)
+
+    def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """The `count` best next strokes [B, count, 4] (m), best first, for goals and current maps [B, H, W] (m), and the
+        critic's values of them [B, count].
+
+        Raises:
+          ValueError: for a scene of another size than it learned on, or without a blade.
+        """
+        if scene.grid.shape != (CELLS, CELLS):
+            raise ValueError(f"scene.grid.shape: got {scene.grid.shape}; this policy only knows ({CELLS}, {CELLS})")
+        depth = float(blade_of(scene).depth)
+        maps = {name: jnp.asarray(x, jnp.float32) / depth for name, x in (("goal", goal), ("current", current))}
+        tried = 1 if count == 1 else _TRIED * count
+        off = self.noise * np.random.default_rng(_SEED).standard_normal((tried, 4)).astype(np.float32)
+        off[0] = 0
+        actions, values = _best(self.actor, self.critic, count, self.of_actor, self.of_critic, maps, off)
+        env, params = MultiStroke(), StrokeParams(scene, LevelGoals(maps["goal"]))
+        strokes = jax.vmap(jax.vmap(lambda action: env.stroke(action, params)))(actions)
+        return np.asarray(strokes, float), np.asarray(values)
+
+
+@partial(jax.jit, static_argnames="actor")
+def _act(actor: Actor, of_actor: Any, observation: Any) -> jax.Array:
+    made: Any = actor.apply(of_actor, observation)
+    return made[0]
+
+
+@partial(jax.jit, static_argnames=("actor", "critic", "count"))
+def _best(
+    actor: Actor, critic: Critic, count: int, of_actor: Any, of_critic: Any, maps: Any, off: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The best actions [B, count, 4] of those that differ from the actor's by `off` [N, 4], and their values [B, count]."""
+    actions = jnp.clip(_act(actor, of_actor, maps)[:, None] + off[None], -1, 1)
+
+    def value(some: jax.Array) -> jax.Array:
+        made: Any = critic.apply(of_critic, maps, some)
+        return made
+
+    values, which = jax.lax.top_k(jax.vmap(value, 1, 1)(actions), count)
+    return jnp.take_along_axis(actions, which[..., None], 1), values

@@ -1,0 +1,100 @@
+"""What DDPG is set to do: an environment, what hindsight gives for it, and how what it learned is judged."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsand.bench.stroke_goals import usual_scene
+from jaxsand.envs.library import RandomStrokes
+from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
+from jaxsand.goals import metrics as task
+from jaxsand.goals.layout import right
+from jaxsand.planning.learned.beam_search import one_after_the_other
+from jaxsand.planning.stroke_loss import pushed
+from jaxsand.scene.tools import Blade
+from train.ddpg.acting import Acts
+from train.evaluation.probes import Probe
+
+_PRACTICE, _SET_APART = 2_000_029, 1_000_003  # seeds of goals
+_ENV = MultiStroke()
+_SHORTEST = 0.15  # stroke of a goal, of the glyphs' square
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Episodes of `count` strokes by the full push towards one of `goals` goals that as many random strokes make of level
+    sand; `trials` others are set apart."""
+
+    count: int = 3
+    goals: int = 1024
+    trials: int = 64
+
+    def world(self) -> tuple[MultiStroke, StrokeParams]:
+        """The environment and its parameters, made once."""
+        return _ENV, _goals(self.count, self.goals, _PRACTICE)
+
+    def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The environment's reward for any goal, from maps [H, W] in units of the blade's depth; no goal is an end."""
+        reward = jnp.sqrt(jnp.sum((goal - before) ** 2)) - jnp.sqrt(jnp.sum((goal - after) ** 2))
+        return reward, jnp.zeros((), bool)
+
+    def most(self, observation: Any) -> jax.Array:
+        """An upper bound [B] of every value: with rewards L_t - L_{t+1}, L >= 0 and a discount g <= 1,
+
+        sum_t g^t (L_t - L_{t+1}) = L_0 - (1 - g) sum_t g^t L_{t+1} <= L_0.
+        """
+        return jnp.sqrt(jnp.sum((observation["goal"] - observation["current"]) ** 2, (1, 2)))
+
+    def validate(self, acts: Acts) -> dict[str, float]:
+        """On goals set apart: the mean share of the l2 distance that is gone, `score`, and how many are `right`."""
+        params = _goals(self.count, self.trials, _SET_APART)
+        goal, depth = np.asarray(params.goals.goals), float(Blade().depth)
+        _, maps = one_after_the_other(acts, params.scene, np.zeros_like(goal), goal, self.count)
+        after = np.nan_to_num(maps[-1])
+        far, left = (np.sqrt(((goal - x) ** 2).sum((1, 2))) for x in (maps[0], after))
+        good = [right(g, x, depth) for g, x in zip(goal, after, strict=True)]
+        return {"score": float(np.mean(1 - left / far)), "right": float(np.mean(good))}
+
+
+@dataclass(frozen=True)
+class Probing:
+    """A probe environment, without hindsight."""
+
+    probe: Probe
+
+    def world(self) -> tuple[Probe, None]:
+        return self.probe, None
+
+    def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Nothing, since a probe has no goals."""
+        return jnp.zeros(()), jnp.zeros((), bool)
+
+    def most(self, observation: Any) -> jax.Array:
+        """None is needed."""
+        return jnp.full(len(observation), jnp.inf, observation.dtype)
+
+    def validate(self, acts: Acts) -> dict[str, float]:
+        """Minus the mean regret of the actions that the actor chooses."""
+        regrets = []
+        for state in self.probe.states():
+            action = acts.act(self.probe.observe(state)[None])[0]
+            regrets.append(self.probe.value(state, self.probe.best(state), 1) - self.probe.value(state, action, 1))
+        return {"score": -float(np.mean(regrets))}
+
+
+Task = Strokes | Probing
+
+
+@cache
+def _goals(count: int, goals: int, seed: int) -> StrokeParams:
+    """The environment's parameters, with goals that random strokes leave; none whose outcome is not clean."""
+    scene = usual_scene()
+    plans = np.stack(RandomStrokes(goals, count, count, _SHORTEST).plans(np.random.default_rng(seed)))
+    maps = np.zeros((goals, *scene.grid.shape), np.float32)
+    for k in range(count):
+        maps = pushed(scene, maps, task.place(plans[:, k]))
+    return StrokeParams(scene, LevelGoals(jnp.asarray(maps[np.isfinite(maps).all((1, 2))])), count)

@@ -1,0 +1,1 @@
+"""Deep Q-learning with hindsight on single strokes over maps: the learner, its networks, targets and tasks."""

@@ -1,0 +1,1 @@
+"""What learners of values remember: a ring of steps, and hindsight experience replay."""
