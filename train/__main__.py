@@ -1,4 +1,4 @@
-"""The command line of the learners: `python -m train --help`. Mistakes end as those of `jaxsand` do."""
+"""The command line of the learners: `python -m train --help`. Wrong arguments end as those of `jaxsand` do."""
 
 import argparse
 import math
@@ -21,7 +21,7 @@ _ABOUT = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
+    """Runs one command and returns its exit code; wrong arguments raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
     draw_without_a_screen()
     keep_compiled_programs()

@@ -1,8 +1,9 @@
-"""How many maps a learner of action values digs by one walk, and in how many steps beside the fewest there are.
+"""How many maps a DQN digs by one walk, and in how many steps compared with the fewest.
 
-A walk is greedy: the legal step of the highest value, without a search or a model. One that has taken `MOST` steps for
-each cell, as one that goes round in circles has, is given up: its map is not solved. Walks start where the map says, and the
-fewest steps are the planner's from there, proven. Looking ahead is another stage: a beam of plans, by the model.
+A walk is greedy: it takes the legal step of the highest value, without a search or a model. A walk that has taken `MOST`
+steps for each cell, such as one that goes round in circles, is given up, and its map is not solved. Walks start where the
+map says, and the fewest steps are the planner's from there, proven. Look-ahead is a beam of plans that uses the environment
+as a model.
 """
 
 import time
@@ -36,8 +37,11 @@ def evaluate(
     """How many maps are `solved`, and how many in the fewest steps (`optimal`).
 
     Args:
-      maps: by name, cells [H, W] to dig and a start, or None for the planner's; the 26 letters with theirs, if None.
+      learner: the DQN.
+      state: its state.
+      maps: by name the cells [H, W] to dig and a start, or None for the planner's; without maps the 26 letters with theirs.
       width: of the beam of plans that looks ahead; 0 walks greedily.
+      tell: is called with a line of progress.
 
     Raises:
       ValueError: for maps of another shape than the learner's, or as `jaxsand.env.map_pool` does.
@@ -69,20 +73,23 @@ def evaluate(
 
 
 def fewest(pool: MapPool) -> np.ndarray:
-    """The fewest steps [G] there are, by the planner."""
+    """The fewest steps [G] of the maps, by the planner."""
     starts = [(int(row), int(column)) for row, column in np.asarray(pool.starts)]
     plans = [plan(dig, start, engine="exact") for dig, start in zip(np.asarray(pool.dig), starts, strict=True)]
     return np.array([one.steps for one in plans])
 
 
 def walks(policy: Greedy, pool: MapPool) -> np.ndarray:
-    """The steps [G] of greedy walks on maps [G, H, W]; 0 where a map is not solved."""
+    """The steps [G] of greedy walks on a pool's maps; 0 where a map is not solved."""
     return np.asarray(_walks(policy, pool))
 
 
 def beams(policy: Greedy, pool: MapPool, width: int) -> np.ndarray:
-    """The steps [G] of the shortest plan in a beam: of all steps from `width` plans, as many different ones go on whose
-    rewards so far, and value of what is left, are highest. 0 where a map is not solved."""
+    """The steps [G] of the shortest plan found by a beam search; 0 where a map is not solved.
+
+    Of all steps from `width` plans, `width` different ones go on whose rewards so far plus value of what is left are
+    highest.
+    """
     return np.asarray(_beams(policy, pool, width))
 
 

@@ -1,4 +1,4 @@
-"""What `make` is given, looked at before anything is computed from it."""
+"""Checks of what `make` is given, before anything is computed from it."""
 
 from typing import Any, get_args
 
@@ -24,7 +24,7 @@ _KINDS: dict[str, Any] = {
 
 
 def check_kinds(options: dict[str, Any]) -> None:
-    """Raises ValueError for an option that is none of the kinds there are."""
+    """Raises ValueError for an option whose value is of the wrong type."""
     for name, value in options.items():
         kind = _KINDS.get(name)
         if kind is not None and not isinstance(value, kind):
@@ -33,7 +33,7 @@ def check_kinds(options: dict[str, Any]) -> None:
 
 
 def check_limit(options: dict[str, Any]) -> None:
-    """Raises ValueError for a limit below one; a traced one is let through."""
+    """Raises ValueError for a limit below one; a traced limit is not checked."""
     if "limit" in options:
         limit = concrete(options["limit"])
         if limit is not None and not np.all(limit >= 1):
@@ -48,7 +48,7 @@ def check_scene(scene: Any) -> None:
 
 
 def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: Any) -> None:
-    """Raises ValueError for maps of another shape than the scene's, and for starts that they would not begin from."""
+    """Raises ValueError for goals that are not of the scene's shape, or with `starts` beside goals that have their own."""
     if goals.goals.shape[-2:] != scene.grid.shape:
         raise ValueError(f"goals: got maps of {list(goals.goals.shape[-2:])}, the scene has {list(scene.grid.shape)} cells")
     if starts is not None:

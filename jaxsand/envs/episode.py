@@ -10,8 +10,11 @@ Step = tuple[Any, Any, jax.Array, jax.Array, jax.Array, dict[str, Any]]
 
 
 class Environment(Protocol):
-    """A kind of task, static and hashable; everything that may vary from one to the next is in `params`, whose leaves may be
-    vmapped. All of it is pure and works on one environment."""
+    """A kind of task, static and hashable.
+
+    Everything that may vary from one environment to the next is in `params`, whose leaves may be vmapped. All methods are
+    pure and work on one environment.
+    """
 
     def reset(self, key: jax.Array, params: Any) -> tuple[Any, Any]: ...
 
@@ -19,10 +22,12 @@ class Environment(Protocol):
 
 
 def step(env: Environment, key: jax.Array, state: Any, action: Any, params: Any) -> Step:
-    """`step_env`, and the first observation and state of a new episode where that ended the old one.
+    """Calls `step_env`, and begins a new episode where that ended the old one.
 
-    `info` holds "final_observation", the last one of the old episode (where none ended, the same as the observation),
-    "terminated" and "truncated".
+    Returns:
+      What `step_env` returns, with the first observation and state of the new episode where one begins. `info` also holds
+      "final_observation", the last one of the old episode (the same as the observation where none ended), "terminated" and
+      "truncated".
     """
     own, fresh = jax.random.split(key)
     obs, state, reward, terminated, truncated, info = env.step_env(own, state, action, params)

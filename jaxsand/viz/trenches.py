@@ -1,4 +1,4 @@
-"""Pictures of the wheel's trenches; matplotlib only."""
+"""Figures of the wheel's trenches, by matplotlib."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -89,6 +89,7 @@ def spacing_figure(rows: list[dict[str, Any]]) -> "Figure":
 
 
 def _labels(axes: Any) -> tuple[list[Any], list[str]]:
+    """Each label in the axes once, with its line."""
     found: dict[str, Any] = {}
     for ax in axes.ravel():
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
