@@ -86,7 +86,7 @@ def run_shipping(options: argparse.Namespace) -> None:
     if not isinstance(learner, Hindsight):
         raise ValueError(f"run: got one of {learner.name}; jaxsand ships what hindsight learned")
     at, seed = about_run(options.run), seed_of(options.run)
-    about = {
+    about: dict[str, float | str] = {
         "command": f"python -m train hindsight --seed {seed} --steps {at.chunk}",
         "seed": seed,
         "chunks": at.chunk,

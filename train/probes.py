@@ -5,13 +5,12 @@ If an agent fails on a probe, the fault lies in one part: the critic, its discou
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxsand.envs import episode
-from jaxsand.envs.episode import Step
+from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.spaces import Box, Discrete
 
 
@@ -123,8 +122,8 @@ class Probe:
         state = ProbeState(sign, jnp.int32(0))
         return self.observe(state), state
 
-    def step_env(self, key: jax.Array, state: ProbeState, action: Any, params: None) -> Step:
-        reward = self.question.reward(self.actions, state, action)
+    def step_env(self, key: jax.Array, state: ProbeState, action: Action, params: None) -> Step[jax.Array, ProbeState]:
+        reward = self.question.reward(self.actions, state, jnp.asarray(action))
         new = ProbeState(state.sign, state.time + 1)
         return self.observe(new), new, reward, new.time >= self.question.steps, jnp.zeros((), bool), {}
 

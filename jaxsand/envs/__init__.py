@@ -4,11 +4,12 @@ They follow the protocol of gymnax 1.x: an environment is a static object, the s
 parameters, and the leaves of both may be vmapped; see `episode.Environment`.
 """
 
-from dataclasses import fields
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import Field, fields
+from typing import Any, Literal, overload
 
 from jaxsand.envs.checks import check_kinds, check_limit, check_ready_goals, check_scene
-from jaxsand.envs.library import Level, RandomStrokes, Rough, library
+from jaxsand.envs.library import Goals, Level, RandomStrokes, Rough, library
 from jaxsand.envs.maps import MapPool, Walks, map_pool, pool_of
 from jaxsand.envs.multi import (
     LevelGoals,
@@ -66,6 +67,22 @@ __all__ = [
 _SHAPE, _SPACING, _WINDOW = (32, 32), 0.01, (12, 12)
 
 
+@overload
+def make(name: Literal["single-stroke"], *, on: OnSand, **options: Any) -> tuple[OnSand, SandParams]: ...
+
+
+@overload
+def make(name: Literal["single-stroke"], *, on: OnMap | None = None, **options: Any) -> tuple[OnMap, MapParams]: ...
+
+
+@overload
+def make(name: Literal["multi-stroke"], **options: Any) -> tuple[MultiStroke, StrokeParams]: ...
+
+
+@overload
+def make(name: str, **options: Any) -> tuple[Any, Any]: ...
+
+
 def make(name: str, **options: Any) -> tuple[Any, Any]:
     """Makes an environment and its parameters, after the protocol of gymnax 1.x.
 
@@ -112,7 +129,9 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
     raise ValueError(f"name: got {name!r}; give single-stroke or multi-stroke")
 
 
-def _single(on: OnMap | OnSand | None = None, scene: Scene | None = None, **params: Any) -> tuple[Any, Any]:
+def _single(
+    on: OnMap | OnSand | None = None, scene: Scene | None = None, **params: Any
+) -> tuple[OnMap, MapParams] | tuple[OnSand, SandParams]:
     """The single stroke with the given options."""
     env = OnMap() if on is None else on
     _known("single-stroke", params, fields(MapParams))
@@ -134,8 +153,12 @@ def _single(on: OnMap | OnSand | None = None, scene: Scene | None = None, **para
 
 
 def _multi(
-    goals: Any = None, starts: Level | Rough | None = None, scene: Scene | None = None, seed: int = 0, **options: Any
-) -> tuple[Any, Any]:
+    goals: Goals | LevelGoals | RoughGoals | None = None,
+    starts: Level | Rough | None = None,
+    scene: Scene | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> tuple[MultiStroke, StrokeParams]:
     """Many strokes with the given options."""
     own = {f.name for f in fields(MultiStroke)}
     chosen = {key: value for key, value in options.items() if key in own}
@@ -157,7 +180,7 @@ def _multi(
     return env, StrokeParams(scene, goals, **params)
 
 
-def _known(name: str, options: dict[str, Any], some: Any) -> None:
+def _known(name: str, options: Mapping[str, object], some: Iterable[Field[Any]]) -> None:
     """Raises ValueError for an option that is none of the fields in `some`."""
     names = [f.name for f in some]
     for option in options:

@@ -1,5 +1,6 @@
 """Checks of what `make` is given, before anything is computed from it."""
 
+from collections.abc import Mapping
 from typing import Any, get_args
 
 import numpy as np
@@ -23,7 +24,7 @@ _KINDS: dict[str, Any] = {
 }
 
 
-def check_kinds(options: dict[str, Any]) -> None:
+def check_kinds(options: Mapping[str, object]) -> None:
     """Raises ValueError for an option whose value is of the wrong type."""
     for name, value in options.items():
         kind = _KINDS.get(name)
@@ -32,7 +33,7 @@ def check_kinds(options: dict[str, Any]) -> None:
             raise ValueError(f"{name}: got {value!r:.60}; give one of {kinds}")
 
 
-def check_limit(options: dict[str, Any]) -> None:
+def check_limit(options: Mapping[str, object]) -> None:
     """Raises ValueError for a limit below one; a traced limit is not checked."""
     if "limit" in options:
         limit = concrete(options["limit"])
@@ -40,14 +41,14 @@ def check_limit(options: dict[str, Any]) -> None:
             raise ValueError(f"limit: got {options['limit']!r}; give 1 step or more to an episode")
 
 
-def check_scene(scene: Any) -> None:
+def check_scene(scene: object) -> None:
     """Raises ValueError unless it is a scene whose tool is a blade."""
     if not isinstance(scene, Scene):
         raise ValueError(f"scene: got {scene!r:.60}; give make_scene(..., tool=Blade())")
     blade_of(scene)
 
 
-def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: Any) -> None:
+def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: object) -> None:
     """Raises ValueError for goals that are not of the scene's shape, or with `starts` beside goals that have their own."""
     if goals.goals.shape[-2:] != scene.grid.shape:
         raise ValueError(f"goals: got maps of {list(goals.goals.shape[-2:])}, the scene has {list(scene.grid.shape)} cells")

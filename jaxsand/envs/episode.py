@@ -1,27 +1,36 @@
 """How an episode ends and the next one begins, for every environment."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 
-Step = tuple[Any, Any, jax.Array, jax.Array, jax.Array, dict[str, Any]]
+Obs = TypeVar("Obs")
+State = TypeVar("State")
+Params = TypeVar("Params")
+Obs_co = TypeVar("Obs_co", covariant=True)
+Params_contra = TypeVar("Params_contra", contravariant=True)
+
+Action = jax.typing.ArrayLike
+Step = tuple[Obs, State, jax.Array, jax.Array, jax.Array, dict[str, Any]]
 """Observation, state, reward, terminated, truncated, info."""
 
 
-class Environment(Protocol):
+class Environment(Protocol[Obs_co, State, Params_contra]):
     """A kind of task, static and hashable.
 
     Everything that may vary from one environment to the next is in `params`, whose leaves may be vmapped. All methods are
     pure and work on one environment.
     """
 
-    def reset(self, key: jax.Array, params: Any) -> tuple[Any, Any]: ...
+    def reset(self, key: jax.Array, params: Params_contra) -> tuple[Obs_co, State]: ...
 
-    def step_env(self, key: jax.Array, state: Any, action: Any, params: Any) -> Step: ...
+    def step_env(self, key: jax.Array, state: State, action: Action, params: Params_contra) -> Step[Obs_co, State]: ...
 
 
-def step(env: Environment, key: jax.Array, state: Any, action: Any, params: Any) -> Step:
+def step(
+    env: Environment[Obs, State, Params], key: jax.Array, state: State, action: Action, params: Params
+) -> Step[Obs, State]:
     """Calls `step_env`, and begins a new episode where that ended the old one.
 
     Returns:

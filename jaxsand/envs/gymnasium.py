@@ -14,7 +14,7 @@ Needs the extra `gym`: pip install 'jaxsand[gym]'.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any, ClassVar
 
@@ -25,8 +25,9 @@ from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
-from jaxsand.envs import Box, MultiStroke, OnMap, make
+from jaxsand.envs import Box, MultiStroke, OnMap, OnSand, make
 
 SINGLE, MULTI = "jaxsand/SingleStroke-v0", "jaxsand/MultiStroke-v0"
 _LOW, _LEVEL, _HIGH, _TOOL = (np.array(c, float) for c in ((30, 60, 130), (222, 196, 150), (110, 60, 20), (200, 30, 30)))
@@ -34,6 +35,7 @@ _PIXELS = 256  # along a panel of a picture, about
 _AT_HOME = os.getpid()  # the process that this module was imported in
 
 Obs = dict[str, Any]
+Core = OnMap | OnSand | MultiStroke
 
 
 def _refuse_forks() -> None:
@@ -45,7 +47,7 @@ def _refuse_forks() -> None:
         )
 
 
-def _known(space: Any, actions: Any, shape: tuple[int, ...]) -> None:
+def _known(space: spaces.Space[Any], actions: ArrayLike, shape: tuple[int, ...]) -> None:
     """Raises ValueError for actions of another shape, and for a step that is none of the four."""
     try:
         given = np.asarray(actions)
@@ -62,6 +64,7 @@ class _Sand(gymnasium.Env):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
     task: ClassVar[str]
+    core: Core
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
         _refuse_forks()
@@ -78,7 +81,7 @@ class _Sand(gymnasium.Env):
         self.shown = _arrays(obs)
         return _view(self.shown), _arrays(about)
 
-    def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         """Takes one action; returns observation, reward, terminated, truncated and info."""
         _known(self.action_space, action, self.action_space.shape or ())
         # No environment draws anything in a step: any key will do.
@@ -87,7 +90,7 @@ class _Sand(gymnasium.Env):
         self.shown = _arrays(obs)
         return _view(self.shown), float(reward), bool(terminated), bool(truncated), _arrays(info)
 
-    def render(self) -> Any:
+    def render(self) -> np.ndarray | None:
         """A picture of goal and sand side by side, [height, width, 3] (uint8); None unless render_mode is "rgb_array"."""
         if self.render_mode is None:
             return None
@@ -138,8 +141,9 @@ class MultiStrokeEnv(_Sand):
     """
 
     task = "multi-stroke"
+    core: MultiStroke
 
-    def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         """Pushes once; returns observation, reward, terminated, truncated and info."""
         previous = self.shown["current"]
         obs, _, terminated, truncated, info = super().step(action)
@@ -147,7 +151,7 @@ class MultiStrokeEnv(_Sand):
         reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], info))
         return obs, reward, terminated, truncated, info
 
-    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Obs | Sequence[Obs]) -> Any:
         """The reward of a push for any goal, exactly as `step` computes it for the goal that was given.
 
         Args:
@@ -162,7 +166,7 @@ class MultiStrokeEnv(_Sand):
           ValueError: if an info does not hold the map before the push.
         """
         single = np.ndim(achieved_goal) == 2
-        infos = [info] if single else list(info)
+        infos: list[Any] = [info] if single else list(info)
         if not all("previous" in one for one in infos):
             raise ValueError(
                 "info: got one without 'previous', the map before the push; keep the infos of `step` "
@@ -217,7 +221,7 @@ class SandVectorEnv(VectorEnv):
         self.shown = _arrays(obs)
         return _view(self.shown), _masked(_arrays(about), np.ones(self.num_envs, bool))
 
-    def step(self, actions: Any) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: ArrayLike) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Takes one action in each, and begins a new episode where one ended."""
         _known(self.single_action_space, actions, self.action_space.shape or ())
         keys = jax.random.split(_key(self.np_random), self.num_envs)
@@ -241,14 +245,14 @@ class SandVectorEnv(VectorEnv):
         self.shown = _arrays(obs)
         return _view(self.shown), reward.astype(float), terminated, truncated, infos
 
-    def render(self) -> Any:
+    def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture of each environment; None unless render_mode is "rgb_array"."""
         if self.render_mode is None:
             return None
         return tuple(picture(self.core, {name: x[i] for name, x in self.shown.items()}) for i in range(self.num_envs))
 
 
-def picture(core: Any, shown: Obs) -> np.ndarray:
+def picture(core: Core, shown: Obs) -> np.ndarray:
     """Draws goal and sand side by side: blue is a blade's depth down, brown as far up, red where the tool stands.
 
     Args:
@@ -291,7 +295,7 @@ def _coloured(height: np.ndarray) -> np.ndarray:
     return _LEVEL + np.maximum(-part, 0) * (_LOW - _LEVEL) + np.maximum(part, 0) * (_HIGH - _LEVEL)
 
 
-def _spaces(core: Any, params: Any) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+def _spaces(core: Core, params: Any) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     """Gymnasium's spaces of an environment's observations and actions."""
     shown, action = core.observation_space(params).spaces, core.action_space(params)
     observation = spaces.Dict(_view({name: _box(box) for name, box in shown.items()}))
@@ -313,7 +317,7 @@ def _arrays(tree: Obs) -> Obs:
     return {name: x if isinstance(x, dict) else np.asarray(x) for name, x in tree.items()}
 
 
-def _masked(info: dict[str, Any], which: np.ndarray) -> dict[str, Any]:
+def _masked(info: Obs, which: np.ndarray) -> dict[str, Any]:
     """Infos of all environments, with Gymnasium's mask of those for which they hold."""
     return info | {f"_{name}": which for name in info}
 
@@ -323,7 +327,7 @@ def _key(random: np.random.Generator) -> jax.Array:
 
 
 @cache
-def _programs(core: Any, step: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _programs(core: Core, step: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """`reset` and a step of one environment, with the mask of actions in the info where it has one."""
 
     def about(state: Any, params: Any) -> Obs:
@@ -341,14 +345,14 @@ def _programs(core: Any, step: Any) -> tuple[Callable[..., Any], Callable[..., A
 
 
 @cache
-def _alone(core: Any) -> tuple[Any, Any]:
+def _alone(core: Core) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The compiled `reset` and step of one environment, which does not begin a new episode."""
     begin, go_on = _programs(core, type(core).step_env)
     return jax.jit(begin), jax.jit(go_on)
 
 
 @cache
-def _together(core: Any) -> tuple[Any, Any]:
+def _together(core: Core) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The compiled `reset` and step of many environments, which begin new episodes."""
     begin, go_on = _programs(core, type(core).step)
     return jax.jit(jax.vmap(begin, (0, None))), jax.jit(jax.vmap(go_on, (0, 0, 0, None)))

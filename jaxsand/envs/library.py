@@ -159,12 +159,12 @@ def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.nda
     heights = jnp.asarray(maps)
     for k in range(max(map(len, plans))):
         strokes = np.stack([task.place(some[min(k, len(some) - 1)], (low, high)) for some in plans]).astype(np.float32)
-        after, _ = push(scene, heights, strokes)
+        after, _ = push(scene, heights, jnp.asarray(strokes))
         due = jnp.array([k < len(some) for some in plans]) & jnp.all(jnp.isfinite(after), axis=(1, 2))
         heights = jnp.where(due[:, None, None], after, heights)
     return np.asarray(heights)
 
 
 @cache
-def _program(pushing: Pushing) -> Any:
+def _program(pushing: Pushing) -> Pushing:
     return jax.jit(jax.vmap(pushing, in_axes=(None, 0, 0)))

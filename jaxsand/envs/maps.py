@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +72,7 @@ class Walks:
         start = jax.random.randint(begin, (2,), 0, jnp.asarray(shape), jnp.int32)
         turns = jnp.array([self.straight, (1 - self.straight) / 2, 1e-6, (1 - self.straight) / 2], jnp.float32)
 
-        def one(k: jax.Array, carry: Any) -> Any:
+        def one(k: jax.Array, carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
             dig, place, heading = carry
             there = place[None] + STEPS
             on = jnp.all((there >= 0) & (there < jnp.asarray(shape, jnp.int32)[None]), axis=1)

@@ -1,13 +1,13 @@
 """Many strokes: each action is a straight push from anywhere to anywhere on the map, after which the sand settles."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsand.envs import episode
-from jaxsand.envs.episode import Step
+from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.pushing import Batching, ByLength, Push
 from jaxsand.envs.spaces import Box, Dict
 from jaxsand.goals import metrics as task
@@ -60,7 +60,7 @@ class WithBerms:
       2.0
     """
 
-    def seen(self, height: jax.Array) -> jax.Array:
+    def seen(self, height: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
         """The map as it is."""
         return height
 
@@ -74,7 +74,7 @@ class OnlyDug:
       0.0
     """
 
-    def seen(self, height: jax.Array) -> jax.Array:
+    def seen(self, height: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
         """What is dug of the map."""
         return task.below(height)
 
@@ -209,7 +209,9 @@ class MultiStroke:
         state = StrokeState(goal, start, jnp.zeros((), jnp.int32))
         return self.observe(state, params), state
 
-    def step_env(self, key: jax.Array, state: StrokeState, action: Any, params: StrokeParams) -> Step:
+    def step_env(
+        self, key: jax.Array, state: StrokeState, action: Action, params: StrokeParams
+    ) -> Step[dict[str, jax.Array], StrokeState]:
         """Makes one stroke, and does not begin a new episode after the last; nothing is drawn from the key.
 
         Returns:

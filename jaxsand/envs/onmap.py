@@ -5,13 +5,12 @@ west.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxsand.envs import episode
-from jaxsand.envs.episode import Step
+from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.maps import STEPS, MapGoals, Walks
 from jaxsand.envs.spaces import Box, Dict, Discrete
 
@@ -91,7 +90,9 @@ class OnMap:
         state = MapState(dig, _only(self.shape, start), start, jnp.zeros((), jnp.int32))
         return self.observe(state), state
 
-    def step_env(self, key: jax.Array, state: MapState, action: Any, params: MapParams) -> Step:
+    def step_env(
+        self, key: jax.Array, state: MapState, action: Action, params: MapParams
+    ) -> Step[dict[str, jax.Array], MapState]:
         """Takes one step, and does not begin a new episode after the last; nothing is drawn from the key.
 
         Returns:

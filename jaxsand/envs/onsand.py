@@ -1,13 +1,12 @@
 """The single stroke on real sand: each step of the walk pushes the blade on by one map cell."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxsand.envs import episode
-from jaxsand.envs.episode import Step
+from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.maps import MapGoals, Walks
 from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.envs.spaces import Box, Dict, Discrete
@@ -102,7 +101,9 @@ class OnSand:
         state = SandState(walk, jnp.zeros(params.scene.grid.shape, jnp.float32))
         return self.observe(state, params), state
 
-    def step_env(self, key: jax.Array, state: SandState, action: Any, params: SandParams) -> Step:
+    def step_env(
+        self, key: jax.Array, state: SandState, action: Action, params: SandParams
+    ) -> Step[dict[str, jax.Array], SandState]:
         """Takes one step, and does not begin a new episode after the last; nothing is drawn from the key.
 
         Returns:

@@ -39,7 +39,7 @@ class Box:
             return self.low + jnp.abs(drawn)
         return self.high - jnp.abs(drawn) if math.isfinite(self.high) else drawn
 
-    def contains(self, x: Any) -> jax.Array:
+    def contains(self, x: jax.typing.ArrayLike) -> jax.Array:
         """Whether x has the shape and lies within the bounds."""
         x = jnp.asarray(x)
         if x.shape != self.shape:
@@ -67,7 +67,7 @@ class Discrete:
         """Draws a number."""
         return jax.random.randint(key, (), 0, self.n, self.dtype)
 
-    def contains(self, x: Any) -> jax.Array:
+    def contains(self, x: jax.typing.ArrayLike) -> jax.Array:
         """Whether x is one of the numbers."""
         x = jnp.asarray(x)
         if x.shape != () or not jnp.issubdtype(x.dtype, jnp.integer):
@@ -95,7 +95,7 @@ class Dict:
         keys = jax.random.split(key, len(self.spaces))
         return {name: space.sample(k) for (name, space), k in zip(self.spaces.items(), keys, strict=True)}
 
-    def contains(self, x: Any) -> jax.Array:
+    def contains(self, x: Mapping[str, Any]) -> jax.Array:
         """Whether x has the keys, and each entry lies in its space."""
         if set(x) != set(self.spaces):
             return jnp.zeros((), bool)

@@ -21,7 +21,7 @@ def letter_strokes(letter: str) -> np.ndarray:
     return np.array(table[letter], float)
 
 
-def stroke_list(field: str, name: object, strokes: Any, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
+def stroke_list(field: str, name: object, strokes: object, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
     """Checks the strokes of a glyph that a user gave, and returns them as an array [n, 4].
 
     Raises:

@@ -12,6 +12,9 @@ import numpy as np
 
 from jaxsand.scene.scene import Scene
 
+_Map = jax.Array | np.ndarray
+"""Heights [..., H, W] (m)."""
+
 GLYPH_SQUARE = (0.035, 0.285)
 """Where a glyph's unit square lies on the 32 x 32 map of 0.01 m cells, in x and y (m)."""
 
@@ -55,7 +58,7 @@ def iou(goal: jax.typing.ArrayLike, height: jax.typing.ArrayLike, depth: jax.typ
     return jnp.where(either == 0, 1.0, both / jnp.maximum(either, 1))
 
 
-def l2(goal: jax.Array, height: jax.Array) -> jax.Array:
+def l2(goal: _Map, height: _Map) -> jax.Array:
     """The l2 distance of two maps, sqrt(sum (goal - h)^2).
 
     Args:
@@ -73,7 +76,7 @@ def l2(goal: jax.Array, height: jax.Array) -> jax.Array:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
-def l2_reduction(goal: jax.Array, before: jax.Array, after: jax.Array) -> jax.Array:
+def l2_reduction(goal: _Map, before: _Map, after: _Map) -> jax.Array:
     """The share of the distance to the goal that is gone, 1 - l2 after / l2 before.
 
     Args:
@@ -95,7 +98,7 @@ def l2_reduction(goal: jax.Array, before: jax.Array, after: jax.Array) -> jax.Ar
     return jnp.where(start > 0, 1 - end / jnp.where(start > 0, start, 1), jnp.where(end > 0, -jnp.inf, 1.0))
 
 
-def below(height: jax.Array) -> jax.Array:
+def below(height: _Map) -> jax.Array:
     """What is dug of a map, min(h, 0).
 
     Args:

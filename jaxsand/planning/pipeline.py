@@ -274,7 +274,7 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:
     """The figures of a result by name; see `ShapeResult`."""
 
-    def reduction(view: Callable[..., Any]) -> float:
+    def reduction(view: Callable[[np.ndarray], np.ndarray]) -> float:
         return float(task.l2_reduction(view(target.goal), view(before.astype(float)), view(after.astype(float))))
 
     whole = reduction(lambda h: h)

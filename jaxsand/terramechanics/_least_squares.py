@@ -9,10 +9,10 @@ the same in every repetition of an experiment, and acts on all parameters togeth
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from jax import lax
 from jaxsand.terramechanics._limit import Reference, seek_limit
 
 Model = TypeVar("Model")
+Free = Sequence[str] | Mapping[str, tuple[float, float]]
+"""The names of the free parameters, or their ranges (low, high) by name."""
+
 _LOOKS = 40
 _NEAR = 1e-4  # of sigma^2: what a step that is not worth taking promises, 0.01 standard errors
 _FINE = 1e-5  # of a range: a step that is none
@@ -134,9 +137,11 @@ class Range:
             raise ValueError(f"free: got {self.low!r} to {self.high!r} for {self.name}; give a finite (low, high)")
 
 
-def as_ranges(free: Any) -> dict[str, tuple[float, float] | None]:
+def as_ranges(free: Free) -> dict[str, tuple[float, float] | None]:
     """Maps each free name to its range, or to None where the user gave none."""
-    ranges = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
+    ranges: dict[str, tuple[float, float] | None] = (
+        dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
+    )
     if not ranges:
         raise ValueError("free: got no names; free at least one parameter")
     for name, ends in ranges.items():
@@ -165,13 +170,58 @@ def spread(ranges: list[Range], starts: int) -> np.ndarray:
     return np.concatenate([first, 0.125 + 0.75 * even])
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Look:
+    """The residuals at one place: `x` [P], `residual` [n], `jacobian` [n, P], and whether the model's outcome was clean."""
+
+    x: jax.Array
+    residual: jax.Array
+    jacobian: jax.Array
+    clean: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Search:
+    """A search from one start: where it looks next, the best place so far, its damping, whether it is done, its looks."""
+
+    trial: jax.Array
+    kept: Look
+    damping: jax.Array
+    done: jax.Array
+    looks: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ends:
+    """Where the searches from S starts ended.
+
+    Attributes:
+      x: places [S, P], in units of the ranges.
+      cost: sum of squared residuals [S].
+      jacobian: [S, n, P].
+      clean: whether the model's outcome was clean [S].
+      done: whether the search converged [S].
+      looks: how often it evaluated the residuals [S].
+    """
+
+    x: jax.Array | np.ndarray
+    cost: jax.Array | np.ndarray
+    jacobian: jax.Array | np.ndarray
+    clean: jax.Array | np.ndarray
+    done: jax.Array | np.ndarray
+    looks: jax.Array | np.ndarray
+
+
 def climb(
     residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
     starts: jax.Array,
     size: int,
     seen: jax.Array,
     noise: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
+) -> Ends:
     """Minimises the squared residuals from every start [S, P], in units of the ranges.
 
     Args:
@@ -182,26 +232,26 @@ def climb(
       noise: standard deviation of the data (m), or NaN to take it from the residuals.
 
     Returns:
-      For each start: where it ended [S, P], the cost there [S], the Jacobian [S, size, P], whether the model was clean [S],
-      whether the search converged [S], and how often it evaluated the residuals [S]. It has converged where a step promises
-      less than 1e-4 sigma^2, or where steps gain nothing however short, as at a kink.
+      Where the searches ended. A search has converged where a step promises less than 1e-4 sigma^2, or where steps gain
+      nothing however short, as at a kink.
     """
 
-    def look(x: jax.Array) -> Any:
-        def twice(x: jax.Array) -> Any:
+    def look(x: jax.Array) -> Look:
+        def twice(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             r, clean = residuals(x)
             return r, (r, clean)
 
         jacobian, (r, clean) = jax.jacfwd(twice, has_aux=True)(x)
-        return x, r, jacobian, clean
+        return Look(x, r, jacobian, clean)
 
-    def advance(state: Any) -> Any:
-        trial, kept, damping, ready, count = state
-        new = look(trial)
+    def advance(state: _Search) -> _Search:
+        new, old = look(state.trial), state.kept
         # The sum is exact where the difference of the costs would be rounded off.
-        better = (count == 0) | (jnp.sum((kept[1] - new[1]) * (kept[1] + new[1])) > 0)
-        x, r, jacobian, clean = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, kept)
-        damping = jnp.clip(jnp.where(better, damping / 8, damping * 8), 1e-5, 1e8)
+        gain = jnp.sum((old.residual - new.residual) * (old.residual + new.residual))
+        better = (state.looks == 0) | (gain > 0)
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        x, r, jacobian = kept.x, kept.residual, kept.jacobian
+        damping = jnp.clip(jnp.where(better, state.damping / 8, state.damping * 8), 1e-5, 1e8)
         slope, curve = jacobian.T @ r, jacobian.T @ jacobian
         held = ((x <= 0) & (slope > 0)) | ((x >= 1) & (slope < 0))
         slope = jnp.where(held, 0, slope)
@@ -213,27 +263,25 @@ def climb(
         sigma2 = jnp.where(jnp.isnan(noise), jnp.sum(r * r) / (seen - x.size), noise**2)
         near = (-jnp.sum(slope * step) < _NEAR * sigma2) & (damping < 1)
         done = near | (jnp.max(jnp.abs(trial - x)) < _FINE)
-        after = trial, (x, r, jacobian, clean), damping, done, count + 1
-        return jax.tree.map(lambda a, b: jnp.where(ready, a, b), state, after)
+        after = _Search(trial, kept, damping, done, state.looks + 1)
+        return jax.tree.map(lambda a, b: jnp.where(state.done, a, b), state, after)
 
-    def goes_on(state: Any) -> jax.Array:
-        return jnp.any(~state[3] & (state[4] < _LOOKS))
+    def goes_on(state: _Search) -> jax.Array:
+        return jnp.any(~state.done & (state.looks < _LOOKS))
 
     many, free = starts.shape
     r, jacobian = jnp.zeros((many, size), starts.dtype), jnp.zeros((many, size, free), starts.dtype)
     no = jnp.zeros(many, bool)
-    begin = (starts, (starts, r, jacobian, no), jnp.full(many, 0.1, starts.dtype), no, jnp.zeros(many, jnp.int32))
-    _, (x, r, jacobian, clean), _, done, count = lax.while_loop(goes_on, jax.vmap(advance), begin)
-    return x, jnp.sum(r * r, axis=1), jacobian, clean, done, count
+    damping, looks = jnp.full(many, 0.1, starts.dtype), jnp.zeros(many, jnp.int32)
+    begin = _Search(starts, Look(starts, r, jacobian, no), damping, no, looks)
+    end = lax.while_loop(goes_on, jax.vmap(advance), begin)
+    at = end.kept
+    return Ends(at.x, jnp.sum(at.residual * at.residual, axis=1), at.jacobian, at.clean, end.done, end.looks)
 
 
 def conclude(
     ranges: list[Range],
-    ends: np.ndarray,
-    costs: np.ndarray,
-    jacobians: np.ndarray,
-    clean: np.ndarray,
-    done: np.ndarray,
+    ends: Ends,
     seen: int,
     noise: float | None,
     calls: int,
@@ -244,16 +292,17 @@ def conclude(
 
     Args:
       ranges: the free parameters, P of them.
-      ends, costs, jacobians, clean, done: what `climb` returned for each start, as numpy arrays.
+      ends: where the searches ended.
       seen: how many residuals are data.
       noise: standard deviation of the data (m), or None to take it from the residuals.
       calls: how many times the model was run.
       model: makes the model of values [P].
       reference: evaluates a model on two grids, to find the grid's part of the errors; None leaves it unknown.
     """
-    costs = np.nan_to_num(costs.astype(float), nan=1e30, posinf=1e30)
+    costs = np.nan_to_num(np.asarray(ends.cost, float), nan=1e30, posinf=1e30)
     best = int(np.argmin(costs))
-    x, cost, jacobian = ends[best].astype(float), float(costs[best]), np.nan_to_num(jacobians[best].astype(float))
+    x, cost, done = np.asarray(ends.x[best], float), float(costs[best]), np.asarray(ends.done)
+    jacobian = np.nan_to_num(np.asarray(ends.jacobian[best], float))
     names, low, high = [r.name for r in ranges], np.array([r.low for r in ranges]), np.array([r.high for r in ranges])
     spare = seen - len(ranges)
     sigma = math.sqrt(cost / spare) if noise is None else noise
@@ -269,7 +318,7 @@ def conclude(
         verdict |= Verdict.NOT_TOLD
     if np.any((np.abs(x - 0.5) > 0.499) & ~hidden):
         verdict |= Verdict.AT_LIMIT
-    apart = np.sum(((ends - x) @ (ways[:, told] * np.sqrt(curves[told]))) ** 2, axis=1)
+    apart = np.sum(((np.asarray(ends.x) - x) @ (ways[:, told] * np.sqrt(curves[told]))) ** 2, axis=1)
     if np.any(done & (costs - cost < 4 * sigma**2) & (apart > 25)):
         verdict |= Verdict.AMBIGUOUS
     if noise is None and spare < _SPARE:
@@ -306,6 +355,6 @@ def conclude(
         residual=math.sqrt(cost / seen),
         noise=sigma,
         calls=calls,
-        verdict=verdict if clean[best] else verdict | Verdict.UNCLEAN,
+        verdict=verdict if ends.clean[best] else verdict | Verdict.UNCLEAN,
         model=model(values),
     )

@@ -4,14 +4,14 @@ _least_squares.py has the method.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxsand.interaction.simulate import Push, check_push, rollout
 from jaxsand.relaxation.schemes import Scheme
@@ -20,17 +20,37 @@ from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, concrete, fit
 from jaxsand.scene.tools import NoTool
-from jaxsand.terramechanics._least_squares import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
+from jaxsand.terramechanics._least_squares import (
+    Calibration,
+    Ends,
+    Free,
+    Range,
+    as_ranges,
+    check_noise,
+    climb,
+    conclude,
+    spread,
+)
 from jaxsand.terramechanics._limit import Reference
 from jaxsand.terramechanics.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 
-Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"
 _TWO = TwoGrids()
 _FINER = 3  # an odd number: cells of both grids have their middles in common
 _ANGLES = (math.radians(10), math.radians(50))
 _Rules = tuple[Push | None, Scheme | None, Stop | None]
-_Group = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # before, after, seen [k, H, W]; strokes [k, n, 4]
+_Labels = np.ndarray | jax.Array | None
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Group:
+    """Trials of equally many strokes: `before`, `after` and `seen` [k, H, W], and `strokes` [k, n, 4]."""
+
+    before: jax.Array
+    after: jax.Array
+    seen: jax.Array
+    strokes: jax.Array
 
 
 @dataclass(frozen=True)
@@ -50,9 +70,9 @@ class Trial:
       True
     """
 
-    before: Any
-    after: Any
-    stroke: Any = None
+    before: ArrayLike | jax.Array
+    after: ArrayLike | jax.Array
+    stroke: ArrayLike | jax.Array | None = None
 
 
 def calibrate(
@@ -60,7 +80,7 @@ def calibrate(
     trials: Trial | Sequence[Trial],
     *,
     free: Free = (_REPOSE, "width", "depth"),
-    regions: Any = None,
+    regions: ArrayLike | jax.Array | None = None,
     noise: float | None = None,
     starts: int = 6,
     push: Push | None = None,
@@ -127,40 +147,49 @@ def calibrate(
     ranges, names = _ranges(scene, free, 0 if labels is None else int(labels.max()) + 1)
     if seen <= len(ranges):
         raise ValueError(f"trials: got {seen} seen cells for {len(ranges)} free parameters; give more, or free fewer")
-    dtype = groups[0][0].dtype
+    dtype = groups[0].before.dtype
     box = jnp.asarray([[r.low for r in ranges], [r.high for r in ranges]], dtype)
     begin, sigma = jnp.asarray(spread(ranges, starts), dtype), jnp.asarray(math.nan if noise is None else noise, dtype)
     rules = (push, scheme, stop)
-    found = _climbs(scene, rules, labels, groups, box, begin, jnp.asarray(seen, dtype), sigma, names)
-    ends, costs, jacobians, clean, done, count = (np.asarray(part) for part in found)
+    ends = _climbs(scene, rules, labels, groups, box, begin, jnp.asarray(seen, dtype), sigma, names)
 
     def model(values: np.ndarray) -> Scene:
         return _with(scene, names, labels, jnp.asarray(values, dtype))
 
-    calls = int(count.sum()) * len(some)
+    calls = int(ends.looks.sum()) * len(some)
     reference = _reference(scene, push, labels, groups, box, names) if isinstance(grid, TwoGrids) else None
-    return conclude(ranges, ends, costs, jacobians, clean, done, seen, noise, calls, model, reference)
+    return conclude(ranges, ends, seen, noise, calls, model, reference)
 
 
 @partial(jax.jit, static_argnames="names")
 def _climbs(
-    scene: Scene, rules: _Rules, labels: Any, groups: list[_Group], box: Any, begin: Any, seen: Any, noise: Any, names: Any
-) -> Any:
+    scene: Scene,
+    rules: _Rules,
+    labels: _Labels,
+    groups: list[_Group],
+    box: jax.Array,
+    begin: jax.Array,
+    seen: jax.Array,
+    noise: jax.Array,
+    names: tuple[str, ...],
+) -> Ends:
     def residuals(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = _with(scene, names, labels, box[0] + x * (box[1] - box[0]))
         return _misfits(there, rules, groups)
 
-    return climb(residuals, begin, sum(before.size for before, *_ in groups), seen, noise)
+    return climb(residuals, begin, sum(group.before.size for group in groups), seen, noise)
 
 
-def _reference(scene: Scene, push: Push | None, labels: Any, groups: list[_Group], box: Any, names: Any) -> Reference:
+def _reference(
+    scene: Scene, push: Push | None, labels: _Labels, groups: list[_Group], box: jax.Array, names: tuple[str, ...]
+) -> Reference:
     """Runs isotropic sand on the scene's grid and on a finer one, for `seek_limit`."""
     coarse = isotropic(scene)
     split = None if labels is None else divide(labels, _FINER)
     resolved = jax.vmap(lambda before: resolve(scene, before, _FINER))
     grids = (
         (coarse, labels, groups),
-        (finer(coarse, _FINER), split, [(resolved(before), *rest) for before, *rest in groups]),
+        (finer(coarse, _FINER), split, [replace(group, before=resolved(group.before)) for group in groups]),
     )
 
     def reference(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -173,7 +202,9 @@ def _reference(scene: Scene, push: Push | None, labels: Any, groups: list[_Group
 
 
 @partial(jax.jit, static_argnames="names")
-def _refers(scene: Scene, labels: Any, groups: list[_Group], push: Push | None, values: Any, names: Any) -> Any:
+def _refers(
+    scene: Scene, labels: _Labels, groups: list[_Group], push: Push | None, values: jax.Array, names: tuple[str, ...]
+) -> tuple[jax.Array, jax.Array]:
     return _misfits(_with(scene, names, labels, values), (push, None, None), groups)
 
 
@@ -183,9 +214,9 @@ def _misfits(scene: Scene, rules: _Rules, groups: list[_Group]) -> tuple[jax.Arr
     A scene on a finer grid than the data's is averaged over the data's cells first.
     """
     misfits, outcomes = [], []
-    for before, after, sees, strokes in groups:
-        height, outcome = _run(scene, rules, before, strokes)
-        misfits.append(jnp.where(sees, means(height, sees[0].shape) - after, 0).ravel())
+    for group in groups:
+        height, outcome = _run(scene, rules, group.before, group.strokes)
+        misfits.append(jnp.where(group.seen, means(height, group.seen[0].shape) - group.after, 0).ravel())
         outcomes.append(outcome)
     return jnp.concatenate(misfits), jnp.all(jnp.concatenate(outcomes) == 0)
 
@@ -204,15 +235,14 @@ def _run(scene: Scene, rules: _Rules, before: jax.Array, strokes: jax.Array) -> 
     return jax.vmap(one)(before, strokes)
 
 
-def _with(scene: Scene, names: tuple[str, ...], labels: Any, values: jax.Array) -> Scene:
+def _with(scene: Scene, names: tuple[str, ...], labels: _Labels, values: jax.Array) -> Scene:
     """The scene with the given values of the free parameters; angles of repose, if any, come first in `values`."""
     fields_of_tool = [name for name in names if name != _REPOSE]
     angles = values[: values.size - len(fields_of_tool)]
     if angles.size:
         scene = replace(scene, material=Material(angles[0] if labels is None else angles[labels]))
     if fields_of_tool:
-        tool: Any = scene.tool
-        scene = replace(scene, tool=replace(tool, **dict(zip(fields_of_tool, values[angles.size :], strict=True))))
+        scene = replace(scene, tool=replace(scene.tool, **dict(zip(fields_of_tool, values[angles.size :], strict=True))))
     return scene
 
 
@@ -223,7 +253,7 @@ def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
     for trial in trials:
         if not isinstance(trial, Trial):
             raise ValueError(f"trials: got {type(trial).__name__}; give Trial(before, after, stroke), or several")
-    groups: dict[int, list[Any]] = {}
+    groups: dict[int, list[_Group]] = {}
     dtype = jnp.result_type(*(as_array("before", trial.before) for trial in trials))
     for trial in trials:
         try:
@@ -243,12 +273,12 @@ def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
             raise ValueError(f"after: got shape {list(after.shape)}; give one like before's, {list(before.shape)}")
         seen = jnp.isfinite(after)
         strokes = strokes.reshape(-1, 4)
-        groups.setdefault(strokes.shape[0], []).append((before, jnp.where(seen, after, 0), seen, strokes))
-    stacked: Any = [tuple(jnp.stack(part) for part in zip(*some, strict=True)) for some in groups.values()]
-    return stacked, sum(int(group[2].sum()) for group in stacked)
+        groups.setdefault(strokes.shape[0], []).append(_Group(before, jnp.where(seen, after, 0), seen, strokes))
+    stacked = [jax.tree.map(lambda *parts: jnp.stack(parts), *some) for some in groups.values()]
+    return stacked, sum(int(group.seen.sum()) for group in stacked)
 
 
-def _labels(scene: Scene, regions: Any) -> np.ndarray | None:
+def _labels(scene: Scene, regions: ArrayLike | jax.Array | None) -> np.ndarray | None:
     if regions is None:
         return None
     labels = np.asarray(regions)

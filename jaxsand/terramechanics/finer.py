@@ -5,7 +5,6 @@ times as high as the exact cone. Only isotropic sand converges to the cone (flux
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +57,7 @@ def finer(scene: Scene, times: int) -> Scene:
     return replace(scene, grid=grid, material=material, walls=walls, window=window)
 
 
-def divide(cells: Any, times: int) -> jax.Array:
+def divide(cells: jax.typing.ArrayLike, times: int) -> jax.Array:
     """Repeats every cell of a map [H, W] `times` along both axes: [times H, times W]."""
     return jnp.repeat(jnp.repeat(jnp.asarray(cells), times, axis=0), times, axis=1)
 

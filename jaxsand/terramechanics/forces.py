@@ -14,7 +14,6 @@ The forces are quasi-static. All functions take scalars and work under jit, grad
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -188,7 +187,7 @@ def failure_angle(soil: Soil, cut: Cut) -> jax.Array:
     soil, cut = lax.stop_gradient((soil, cut))
     stop = math.pi - (jnp.asarray(cut.rake) + soil.friction + soil.interface_friction)
 
-    def narrow(_: Any, span: jax.Array) -> jax.Array:
+    def narrow(_: jax.Array, span: jax.Array) -> jax.Array:
         grid = span[0] + (span[1] - span[0]) * jnp.linspace(0, 1, 33, dtype=stop.dtype)
         return lax.dynamic_slice(grid, [jnp.clip(jnp.argmin(_stress(soil, cut, grid)), 1, 31) - 1], [3])[::2]
 
@@ -395,7 +394,7 @@ def _check_soil(soil: Soil) -> None:
         _check(f"soil.{name}", getattr(soil, name), low, high, "give SI units; for degrees use math.radians(30)")
 
 
-def _check(name: str, value: Any, low: float, high: Any, remedy: str) -> None:
+def _check(name: str, value: Scalar, low: float, high: Scalar, remedy: str) -> None:
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array) and low <= array <= high):
         least = "above" if low else "of at least"

@@ -5,15 +5,14 @@ z(x) = lift + tilt x + profile(x - shift). Derivatives are central differences.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.terramechanics._least_squares import Calibration, Range, as_ranges, check_noise, conclude, spread
+from jaxsand.terramechanics._least_squares import Calibration, Ends, Free, Range, as_ranges, check_noise, conclude, spread
 from jaxsand.terramechanics.wheel_trench import Pass, Profile, relaxing
 
 _SHARED = ("repose_angle", "radius", "width")
@@ -57,7 +56,7 @@ class Section:
 def calibrate_sections(
     sections: Section | Sequence[Section],
     *,
-    free: Sequence[str] | Mapping[str, tuple[float, float]] = ("repose_angle", "sinkage"),
+    free: Free = ("repose_angle", "sinkage"),
     noise: float | None = None,
     starts: int = 4,
     model: Callable[[Pass], Profile] | None = None,
@@ -139,19 +138,15 @@ def calibrate_sections(
     def passes(values: np.ndarray) -> tuple[Pass, ...]:
         return tuple(_placed(section.run, k, keys, values)[0] for k, section in enumerate(some))
 
-    return conclude(
-        ranges,
-        np.array([end.x - 1 for end in ends]),
-        np.array([2 * end.cost for end in ends]),
-        np.array([end.jac for end in ends]),
-        np.array([np.abs(end.jac).max() < 1 for end in ends]),  # m to a range: else the model ends next to the estimate
-        np.array([end.status > 0 for end in ends]),
-        count,
-        noise,
-        calls,
-        passes,
-        reference,
+    found = Ends(
+        x=np.array([end.x - 1 for end in ends]),
+        cost=np.array([2 * end.cost for end in ends]),
+        jacobian=np.array([end.jac for end in ends]),
+        clean=np.array([np.abs(end.jac).max() < 1 for end in ends]),  # m to a range: else the model ends next to it
+        done=np.array([end.status > 0 for end in ends]),
+        looks=np.array([end.nfev for end in ends]),
     )
+    return conclude(ranges, found, count, noise, calls, passes, reference)
 
 
 def _placed(run: Pass, k: int, keys: list[tuple[str, int]], values: np.ndarray) -> tuple[Pass, dict[str, float]]:
@@ -161,7 +156,7 @@ def _placed(run: Pass, k: int, keys: list[tuple[str, int]], values: np.ndarray) 
     return replace(run, **own), place
 
 
-def _ranges(sections: list[Section], free: Any) -> tuple[list[Range], list[tuple[str, int]]]:
+def _ranges(sections: list[Section], free: Free) -> tuple[list[Range], list[tuple[str, int]]]:
     """A range for every parameter, and its name and section (-1 where all sections share it)."""
     known = [field.name for field in fields(Pass)]
     asked = as_ranges(free)

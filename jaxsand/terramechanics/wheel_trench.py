@@ -21,7 +21,6 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -274,8 +273,14 @@ def unsettled(run: Pass) -> Profile:
     # The chords of a parabola lie above it; lowered by as much, they hold its area.
     flank = -run.sinkage * (1 - eta**2 + (eta[1] - eta[0]) ** 2 / 6)
     out = run.rim / 2 + run.flank * eta
-    x: list[Any] = [[-w / 2 - left / t, -w / 2], -out, [-out[-1], out[-1]], out[::-1], [w / 2, w / 2 + right / t]]
-    z: list[Any] = [[0, left], flank, [-run.floor(), -run.floor()], flank[::-1], [right, 0]]
+    x: list[np.ndarray | list[float]] = [
+        [-w / 2 - left / t, -w / 2],
+        -out,
+        [-out[-1], out[-1]],
+        out[::-1],
+        [w / 2, w / 2 + right / t],
+    ]
+    z: list[np.ndarray | list[float]] = [[0, left], flank, [-run.floor(), -run.floor()], flank[::-1], [right, 0]]
     return Profile(np.concatenate(x), np.concatenate(z))
 
 

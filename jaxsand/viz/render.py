@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsand.planning.binary import Plan
-from jaxsand.planning.pipeline import ShapeResult
+from jaxsand.planning.pipeline import ShapeResult, Target
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -207,7 +207,7 @@ def lit(height: np.ndarray, spacing: float) -> np.ndarray:
     return shade
 
 
-def _map(axes: "Axes", values: np.ndarray, target: Any, title: str, colours: str, top: float, label: str) -> None:
+def _map(axes: "Axes", values: np.ndarray, target: Target, title: str, colours: str, top: float, label: str) -> None:
     """Draws a map with its colour bar."""
     image = axes.imshow(values, origin="lower", extent=_extent(target), cmap=colours, vmin=-top, vmax=top)
     axes.set_title(title, loc="left")
@@ -243,7 +243,7 @@ def _outline(result: ShapeResult, tool: np.ndarray) -> np.ndarray:
     return np.stack([x + corners @ [cos, -sin], y + corners @ [sin, cos]], 1)
 
 
-def _extent(target: Any) -> tuple[float, float, float, float]:
+def _extent(target: Target) -> tuple[float, float, float, float]:
     """The map's left, right, lower and upper edge (m)."""
     rows, columns = target.scene.grid.shape
     dx = float(target.scene.grid.spacing)

@@ -6,9 +6,10 @@ mended, so the walk stays on the goal's cells (arXiv:1908.02745, "Single Stroke"
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxsand.planning.binary.anytime import anytime, nearest_first, simple_bound
 from jaxsand.planning.binary.astar import LARGEST, astar
@@ -26,8 +27,8 @@ _MOST = 1 << 27
 
 
 def plan(
-    dig: Any,
-    start: Any = None,
+    dig: ArrayLike,
+    start: ArrayLike | None = None,
     *,
     end: Cell | None = None,
     turn_cost: float = 0,

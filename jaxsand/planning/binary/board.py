@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
@@ -61,7 +61,7 @@ class Problem:
     turn_cost: float = 0
 
 
-def make_problem(dig: Any, start: Any = None, end: Cell | None = None, turn_cost: float = 0) -> Problem:
+def make_problem(dig: ArrayLike, start: ArrayLike | None = None, end: Cell | None = None, turn_cost: float = 0) -> Problem:
     """Checks a user's map, start, end and turn cost, and makes the problem of them.
 
     Args:
@@ -104,7 +104,7 @@ def make_problem(dig: Any, start: Any = None, end: Cell | None = None, turn_cost
     return Problem(Board(dig.shape, tuple(cells), near), tuple(dict.fromkeys(chosen)), goal, float(turn_cost))
 
 
-def _several(field: str, start: Any) -> list[Cell]:
+def _several(field: str, start: ArrayLike) -> list[Cell]:
     """A user's cell or cells as a list."""
     given = np.asarray(start)
     if given.ndim not in (1, 2) or given.shape[-1] != 2 or not given.size or given.dtype.kind not in "iu":

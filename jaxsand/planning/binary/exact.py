@@ -11,7 +11,7 @@ from the start, or, where any start will do, from any cell.
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
+from typing import TypeAlias
 
 from jaxsand.planning.binary.board import Block, Board, Hanging, Problem, blocks_of, hang
 from jaxsand.planning.binary.plans import Found
@@ -84,6 +84,9 @@ class _Swap:
     times: tuple[int, ...]
 
 
+_Swaps: TypeAlias = "_Swap | tuple[_Swaps, ...]"
+
+
 @dataclass(frozen=True)
 class _Saving:
     """What open walks save over closed ones if one end of the walk, or both, lie at a cell or in blocks below it.
@@ -94,7 +97,7 @@ class _Saving:
     """
 
     value: int
-    swaps: Any = ()
+    swaps: _Swaps = ()
 
     def __add__(self, other: "_Saving") -> "_Saving":
         return _Saving(self.value + other.value, (self.swaps, other.swaps))
@@ -235,9 +238,10 @@ def _odd(block: Block, times: tuple[int, ...]) -> set[int]:
     return odd
 
 
-def _flat(swaps: Any) -> list[_Swap]:
+def _flat(swaps: _Swaps) -> list[_Swap]:
     """The `_Swap`s in nested pairs, as one list."""
-    found, stack = [], [swaps]
+    found: list[_Swap] = []
+    stack = [swaps]
     while stack:
         one = stack.pop()
         if isinstance(one, _Swap):

@@ -10,7 +10,6 @@ order that comes closest to the goal.
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -172,7 +171,7 @@ def _prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Arra
 
 
 @cache
-def _adam() -> Any:
+def _adam() -> optax.GradientTransformation:
     return optax.adam(_STEP)
 
 
@@ -211,7 +210,7 @@ def _moved(mark: Print, plans: jax.Array, start: jax.Array, goal: jax.Array, tap
     def far(plan: jax.Array) -> jax.Array:
         return jnp.sum(smooth(_off(mark, plan, start, goal)) ** 2) * _SCALE
 
-    def step(carry: Any, _: Any) -> tuple[Any, None]:
+    def step(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple[jax.Array, optax.OptState], None]:
         plans, state = carry
         update, state = _adam().update(jax.vmap(jax.grad(far))(plans), state)
         return (optax.apply_updates(plans, update), state), None

@@ -8,7 +8,7 @@ ends, as the second stage of a detector does (Ren et al. 2015).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,8 @@ from flax import linen as nn
 
 from jaxsand.planning.learned.square_symmetries import turned, turned_back, turned_strokes, turned_strokes_back
 
-Params = Any
+Params = Mapping[str, Any]
+"""The parameters of a flax network: arrays in nested dictionaries."""
 
 _STARTS = 32  # peaks of the starts
 _ENDS = 12  # peaks of the ends from each

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from jaxsand.planning.learned.network import StrokeNet, judge, likeliest, symmetric
+from jaxsand.planning.learned.network import Params, StrokeNet, judge, likeliest, symmetric
 from jaxsand.scene.scene import Scene, blade_of
 
 SIDE = 32
@@ -40,7 +40,7 @@ class Policy:
     """
 
     net: StrokeNet
-    params: Any
+    params: Params
 
     def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Proposes the likeliest next strokes for a batch of goals.
@@ -95,12 +95,12 @@ def in_batches(
 
 
 @partial(jax.jit, static_argnames=("net", "count"))
-def _read(net: StrokeNet, params: Any, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _read(net: StrokeNet, params: Params, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The `count` likeliest strokes [B, count, 4] (cells) and their scores [B, count]."""
     return likeliest(judge(net, params), symmetric(net, params, goal, current), count)
 
 
-def save_policy(policy: Policy, path: Path, **about: Any) -> None:
+def save_policy(policy: Policy, path: Path, **about: float | str) -> None:
     """Writes a policy in half precision, with notes `about` it, which are numbers and text."""
     flat = traverse_util.flatten_dict(policy.params, sep="/")
     arrays: dict[str, Any] = {name: np.asarray(x, np.float16) for name, x in flat.items()}

@@ -1,7 +1,6 @@
 """Simulates the children of a search on real sand, many at once."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from jaxsand.interaction.batched import act_batch, step_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.simulate import check, follow
 from jaxsand.planning.search.actions import Path
-from jaxsand.relaxation.settling import settle_batch
+from jaxsand.relaxation.settling import Settled, settle_batch
 from jaxsand.relaxation.stopping import Sweeps
 from jaxsand.scene.scene import Scene
 
@@ -102,7 +101,7 @@ def marks(maps: np.ndarray, grain: float) -> list[bytes]:
     return [one.tobytes() for one in rounded]
 
 
-def _clean(result: Any) -> np.ndarray:
+def _clean(result: Settled) -> np.ndarray:
     """The maps of a batch, NaN where the outcome is not clean."""
     good = np.asarray(result.outcome) == 0
     if not good.any():

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -10,6 +9,7 @@ from jaxsand.planning.search.actions import Job, Path, confined, moved, propose
 from jaxsand.planning.search.rollouts import CHEAP, Effort, distance, distinct, marks, pushed, roughly_pushed
 from jaxsand.scene.scene import Scene
 
+_Push = Callable[[Scene, np.ndarray, np.ndarray], np.ndarray]  # what strokes [n, 4] make of maps [n, H, W]
 _LAYERS = 0.25  # of the budget goes to the layers, half of it to rough pushes
 _GRAIN = 1 / 20  # of the largest height to change: what maps are told apart by
 _TRIED = 8  # variants of a plan, the best by rough pushes, are pushed in full
@@ -106,7 +106,7 @@ def improved(job: Job, plans: np.ndarray, budget: float, rng: np.random.Generato
     return plans[best][: int(distance(ways[best], job.goal).argmin())], effort
 
 
-def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push: Callable[..., Any] = pushed) -> np.ndarray:
+def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push: _Push = pushed) -> np.ndarray:
     """Pushes the strokes of plans [m, n, 4] from stroke `first` on.
 
     Returns:
