@@ -7,11 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from jaxsand.bench.stroke_goals import CELLS
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.scene.scene import Scene, blade_of
-from train.nets import Actor, Critic
+from train.nets import Actor, Critic, Observation
 
 _TRIED = 16  # actions for each one that is asked for
 _SEED = 0  # of how they differ from the actor's, the same at every look
@@ -30,11 +31,11 @@ class Acts:
 
     actor: Actor
     critic: Critic
-    of_actor: Any
-    of_critic: Any
+    of_actor: optax.Params
+    of_critic: optax.Params
     noise: float
 
-    def act(self, observation: Any) -> jax.Array:
+    def act(self, observation: Observation) -> jax.Array:
         """The actor's actions [B, A] for observations [B, ...]."""
         return _act(self.actor, self.of_actor, observation)
 
@@ -66,14 +67,20 @@ class Acts:
 
 
 @partial(jax.jit, static_argnames="actor")
-def _act(actor: Actor, of_actor: Any, observation: Any) -> jax.Array:
+def _act(actor: Actor, of_actor: optax.Params, observation: Observation) -> jax.Array:
     made: Any = actor.apply(of_actor, observation)
     return made[0]
 
 
 @partial(jax.jit, static_argnames=("actor", "critic", "count"))
 def _best(
-    actor: Actor, critic: Critic, count: int, of_actor: Any, of_critic: Any, maps: Any, off: jax.Array
+    actor: Actor,
+    critic: Critic,
+    count: int,
+    of_actor: optax.Params,
+    of_critic: optax.Params,
+    maps: dict[str, jax.Array],
+    off: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """The best actions [B, count, 4] among the actor's own moved by `off` [N, 4], and their values [B, count]."""
     actions = jnp.clip(_act(actor, of_actor, maps)[:, None] + off[None], -1, 1)

@@ -7,11 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.envs.onmap import MapParams
 from train.dqn_tasks import Task
 from train.her import Steps, last_steps
+from train.nets import Observation
 from train.qnet import best, of
 
-Values = Callable[[Any], jax.Array]
+Values = Callable[[Observation], jax.Array]
 """Observations [B, ...] to the values of their actions [B, A]."""
 
 
@@ -60,7 +62,7 @@ class Sampled:
     """
 
     def targets(
-        self, task: Task, world: Any, gamma: float, items: Items, online: Values, slow: Values
+        self, task: Task, world: MapParams | None, gamma: float, items: Items, online: Values, slow: Values
     ) -> tuple[jax.Array, jax.Array]:
         """Targets [B, A] and their weights [B, A], which sum to 1 in a row.
 
@@ -90,7 +92,7 @@ class Every:
     branches: int = 2
 
     def targets(
-        self, task: Task, world: Any, gamma: float, items: Items, online: Values, slow: Values
+        self, task: Task, world: MapParams | None, gamma: float, items: Items, online: Values, slow: Values
     ) -> tuple[jax.Array, jax.Array]:
         """Targets [B, A] and their weights [B, A], which sum to 1 in a row, or to 0 without room; see `Sampled.targets`."""
         legal = jax.vmap(task.legal)(items.observation)

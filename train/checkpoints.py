@@ -14,11 +14,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.lib.npyio import NpzFile
 
 State = Any
 """A pytree of arrays (typed keys too): parameters, optimiser, buffer, environments, key, counters; everything."""
@@ -93,7 +94,7 @@ def where(path: Path) -> At:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Iterator[NpzFile]:
     """Opens a checkpoint; raises ValueError with advice if that fails."""
     try:
         with path.open("rb") as file, np.load(file) as data:
@@ -114,7 +115,7 @@ def unwritable(path: Path, error: OSError) -> ValueError:
     )
 
 
-def described(thing: Any) -> Any:
+def described(thing: object) -> Any:
     """A learner, or a part of it, as JSON data: frozen dataclasses of numbers, texts, tuples and other such dataclasses."""
     if is_dataclass(thing):
         own = {f.name: described(getattr(thing, f.name)) for f in fields(thing) if f.init}
@@ -156,7 +157,7 @@ def _named(state: State) -> dict[str, Any]:
     return {_STATE + jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in paths}
 
 
-def _is_key(leaf: Any) -> bool:
+def _is_key(leaf: object) -> TypeGuard[jax.Array]:
     return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
@@ -165,13 +166,13 @@ def _plain(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _like(leaf: Any, array: np.ndarray) -> Any:
+def _like(leaf: object, array: np.ndarray) -> jax.Array | np.ndarray:
     """An array of a file as a leaf of the kind of `leaf`."""
     if _is_key(leaf):
         return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(leaf))
     return jnp.asarray(array) if isinstance(leaf, jax.Array) else array
 
 
-def _kind(array: Any) -> str:
+def _kind(array: jax.Array | np.ndarray | None) -> str:
     """Dtype and shape, for messages."""
     return "nothing" if array is None else f"{np.dtype(array.dtype).name}{list(array.shape)}"

@@ -5,12 +5,17 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jaxsand
 from jaxsand.bench.tables import as_table
 from jaxsand.cli.files import existing, folder, progress, write_json, written
 from jaxsand.cli.printing import lines, show
+
+if TYPE_CHECKING:
+    from jaxsand.planning.learned.beam_search import Proposes
+    from train.dqn import Dqn, Walking
+    from train.runs import Learner
 
 MINUTES = {"hindsight": 30.0, "dqn": 10.0, "ddpg": 10.0}
 """How long each learner trains unless it is told."""
@@ -99,7 +104,7 @@ def run_shipping(options: argparse.Namespace) -> None:
     show(options, {"file": str(options.out_file), "bytes": options.out_file.stat().st_size, **about}, lines)
 
 
-def _learner(options: argparse.Namespace) -> tuple[Any, int | None]:
+def _learner(options: argparse.Namespace) -> tuple["Learner", int | None]:
     """The learner, and the number of chunks after which it ends by itself, if any.
 
     Raises:
@@ -111,7 +116,7 @@ def _learner(options: argparse.Namespace) -> tuple[Any, int | None]:
         raise ValueError(f"{options.learner}: {error.name} is not there; run pip install 'jaxsand[train]'") from None
 
 
-def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
+def _made(options: argparse.Namespace) -> tuple["Learner", int | None]:
     """The learner, and the number of chunks after which it ends by itself, if any."""
     if options.learner == "hindsight":
         from train.hindsight import Hindsight
@@ -127,7 +132,9 @@ def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
     return (paper, None if options.minutes else paper.chunks(EPISODES)) if options.paper else (Ddpg(), None)
 
 
-def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None) -> dict[str, Any]:
+def _on_sand(
+    policy: "Proposes", options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
+) -> dict[str, Any]:
     """Evaluates a policy on glyphs, and writes report and picture if asked."""
     from jaxsand.planning.learned.stages import Stages
     from train.evaluate import evaluate, picture
@@ -148,7 +155,7 @@ def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], Non
 
 
 def _on_maps(
-    learner: Any, state: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
+    learner: "Dqn", state: "Walking", options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
 ) -> dict[str, Any]:
     """Evaluates a DQN on letter maps, and writes the report if asked."""
     for option in ("glyphs", "goals", "refine"):

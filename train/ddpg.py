@@ -20,10 +20,11 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxsand.envs.multi import StrokeParams
 from train.actor import Acts
 from train.buffer import Buffer
 from train.her import Future, Steps, Strategy, mixed
-from train.nets import Actor, Critic, Flat, Maps, Sight
+from train.nets import Actor, Critic, Flat, Maps, Observation, Sight
 from train.tasks import Strokes, Task
 
 _REMEMBERED = jnp.float16  # observations: maps in units of the blade's depth
@@ -34,12 +35,12 @@ _REMEMBERED = jnp.float16  # observations: maps in units of the blade's depth
 class Agent:
     """The parameters of actor and critic, of their target copies, and both optimisers' states."""
 
-    actor: Any
-    critic: Any
-    slow_actor: Any
-    slow_critic: Any
-    actor_optimiser: Any
-    critic_optimiser: Any
+    actor: optax.Params
+    critic: optax.Params
+    slow_actor: optax.Params
+    slow_critic: optax.Params
+    actor_optimiser: optax.OptState
+    critic_optimiser: optax.OptState
 
 
 @jax.tree_util.register_dataclass
@@ -51,7 +52,7 @@ class Practice:
 
     agent: Agent
     memory: Any
-    observation: Any
+    observation: Observation
     world: Any
     key: jax.Array
     chunk: jax.Array
@@ -148,7 +149,7 @@ class Ddpg:
 
 
 @partial(jax.jit, static_argnames="learner")
-def begin(learner: Ddpg, params: Any, key: jax.Array) -> Practice:
+def begin(learner: Ddpg, params: StrokeParams | None, key: jax.Array) -> Practice:
     """The state before the first chunk; `params` are the environments'. It may be vmapped over keys."""
     env, _ = learner.world()
     key, first, second, reset = jax.random.split(key, 4)
@@ -164,7 +165,7 @@ def begin(learner: Ddpg, params: Any, key: jax.Array) -> Practice:
 
 
 @partial(jax.jit, static_argnames="learner")
-def practise(learner: Ddpg, params: Any, state: Practice) -> tuple[Practice, dict[str, jax.Array]]:
+def practise(learner: Ddpg, params: StrokeParams | None, state: Practice) -> tuple[Practice, dict[str, jax.Array]]:
     """One chunk. It may be vmapped over states, for many seeds at once."""
     key, act, learn = jax.random.split(state.key, 3)
     where, row = _explore(learner, params, state, act)
@@ -186,10 +187,10 @@ def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, j
     ahead = jnp.minimum(ahead, learner.task.most(some.after))
     target = some.reward + learner.discount * jnp.where(some.terminated, 0, ahead)
 
-    def critic_loss(critic: Any) -> jax.Array:
+    def critic_loss(critic: optax.Params) -> jax.Array:
         return jnp.mean((target - _value(learner, critic, some.observation, some.action)) ** 2)
 
-    def actor_loss(actor: Any) -> tuple[jax.Array, jax.Array]:
+    def actor_loss(actor: optax.Params) -> tuple[jax.Array, jax.Array]:
         action, raw = _act(learner, actor, some.observation)
         value = jnp.mean(_value(learner, agent.critic, some.observation, action))
         return learner.calm * jnp.mean(raw**2) - value, value
@@ -207,12 +208,14 @@ def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, j
     return new, {"loss": loss, "value": value}
 
 
-def _explore(learner: Ddpg, params: Any, state: Practice, key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
+def _explore(
+    learner: Ddpg, params: StrokeParams | None, state: Practice, key: jax.Array
+) -> tuple[tuple[Observation, Any], Steps]:
     """The environments' observations and states after `steps` steps, and these steps, [E, T, ...]."""
     env, _ = learner.world()
     share = jnp.where(state.chunk < learner.warm, 1.0, learner.random)
 
-    def one(where: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
+    def one(where: tuple[Observation, Any], key: jax.Array) -> tuple[tuple[Observation, Any], Steps]:
         observation, world = where
         noise, uniform, which, world_key = jax.random.split(key, 4)
         action, _ = _act(learner, state.agent.actor, observation)
@@ -241,12 +244,12 @@ def _drawn(learner: Ddpg, key: jax.Array, rows: Steps) -> Steps:
     return jax.vmap(one)(jax.random.split(key, learner.batch), rows)
 
 
-def _act(learner: Ddpg, actor: Any, observation: Any) -> tuple[jax.Array, jax.Array]:
+def _act(learner: Ddpg, actor: optax.Params, observation: Observation) -> tuple[jax.Array, jax.Array]:
     made: Any = learner.actor.apply(actor, observation)
     return made[0], made[1]
 
 
-def _value(learner: Ddpg, critic: Any, observation: Any, action: jax.Array) -> jax.Array:
+def _value(learner: Ddpg, critic: optax.Params, observation: Observation, action: jax.Array) -> jax.Array:
     value: Any = learner.critic.apply(critic, observation, action)
     return value
 
@@ -259,5 +262,5 @@ def _optimisers(learner: Ddpg) -> tuple[optax.GradientTransformation, optax.Grad
     return optax.adam(learner.actor_rate), optax.adam(learner.critic_rate)
 
 
-def _remembered(observation: Any) -> Any:
+def _remembered(observation: Observation) -> Observation:
     return jax.tree.map(lambda x: x.astype(_REMEMBERED), observation)

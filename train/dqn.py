@@ -20,11 +20,17 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxsand.envs.onmap import MapParams, MapState
 from train.backup import Backup, Every, Items, Sampled, items_of
 from train.buffer import Buffer
 from train.dqn_tasks import SingleStroke, Task
 from train.her import Final, Steps, Strategy, chosen, relabel
+from train.nets import Observation
+from train.probes import ProbeState
 from train.qnet import Bins, Greedy, Head, Mean, QNet
+
+Learned = tuple[optax.Params, optax.Params, optax.OptState]
+"""A network's parameters, their moving average, and the optimiser's state."""
 
 
 @jax.tree_util.register_dataclass
@@ -42,11 +48,11 @@ class Walking:
       chunk: chunks done.
     """
 
-    params: Any
-    average: Any
-    optimiser: Any
+    params: optax.Params
+    average: optax.Params
+    optimiser: optax.OptState
     memory: Any
-    observation: Any
+    observation: Observation
     world: Any
     key: jax.Array
     chunk: jax.Array
@@ -155,13 +161,17 @@ def _optimiser() -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(10.0), optax.scale_by_adam())
 
 
-def _walk(learner: Dqn, state: Walking, params: Any, key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
+def _walk(
+    learner: Dqn, state: Walking, params: MapParams | None, key: jax.Array
+) -> tuple[tuple[Observation, MapState | ProbeState], Steps]:
     """The environments' last observations and states [E, ...], and their steps [T, E, ...]."""
     task: Any = learner.task
     number, policy = learner.envs, learner.walker(state)
     share = learner.careful ** jnp.linspace(1 / 8, 1, number)
 
-    def one(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
+    def one(
+        carry: tuple[Observation, MapState | ProbeState], key: jax.Array
+    ) -> tuple[tuple[Observation, MapState | ProbeState], Steps]:
         seen, world = carry
         chance, choose, step = jax.random.split(key, 3)
         legal = jax.vmap(task.legal)(seen)
@@ -195,20 +205,20 @@ def _items(learner: Dqn, rows: Steps, key: jax.Array) -> Items:
 
 
 def _learn(
-    learner: Dqn, state: Walking, params: Any, sample: Callable[[jax.Array], Items], key: jax.Array
-) -> tuple[tuple[Any, Any, Any], jax.Array]:
+    learner: Dqn, state: Walking, params: MapParams | None, sample: Callable[[jax.Array], Items], key: jax.Array
+) -> tuple[Learned, jax.Array]:
     """The network's parameters, their average and the optimiser's state after the chunk's updates, and the losses."""
     net = learner.net
     rate = learner.rate * jnp.minimum(1.0, jnp.sqrt(learner.decay / (state.chunk + 1.0)))
 
-    def one(carry: tuple[Any, Any, Any], key: jax.Array) -> tuple[tuple[Any, Any, Any], jax.Array]:
+    def one(carry: Learned, key: jax.Array) -> tuple[Learned, jax.Array]:
         own, average, optimiser = carry
         items = sample(key)
         targets, weights = learner.backup.targets(
             learner.task, params, learner.gamma, items, Greedy(net, own).values, Greedy(net, average).values
         )
 
-        def loss(own: Any) -> jax.Array:
+        def loss(own: optax.Params) -> jax.Array:
             made: Any = net.apply(own, items.observation)
             return jnp.mean(jnp.sum(weights * net.head.loss(made, targets), axis=1))
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from string import ascii_uppercase
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -18,18 +18,24 @@ import numpy as np
 from jax import lax
 
 from jaxsand.envs.maps import STEPS, MapPool, map_pool
-from jaxsand.envs.onmap import MapParams, OnMap
+from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.goals import letters as goals
 from jaxsand.planning.binary import Cell, plan
 from train.qnet import Greedy, best, of
 
+if TYPE_CHECKING:
+    from train.dqn import Dqn, Walking
+
 MOST = 3
 """Steps for each cell."""
 
+_Carry = tuple[dict[str, jax.Array], MapState, jax.Array, jax.Array]  # observations, states, steps taken, the step's number
+_Beam = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # dug, places, alive, steps taken, the step's number
+
 
 def evaluate(
-    learner: Any,
-    state: Any,
+    learner: "Dqn",
+    state: "Walking",
     maps: Mapping[str, tuple[np.ndarray, Cell | None]] | None = None,
     width: int = 0,
     tell: Callable[[str], None] = lambda _: None,
@@ -48,7 +54,8 @@ def evaluate(
     """
     began = time.perf_counter()
     maps = maps or {letter: goals.letter_map(letter) for letter in ascii_uppercase}
-    shape = learner.task.env.shape
+    env: Any = learner.task.env
+    shape = env.shape
     for name, (dig, _) in maps.items():
         if np.shape(dig) != shape:
             raise ValueError(f"maps: {name!r} has shape {list(np.shape(dig))}; give maps of {list(shape)} cells")
@@ -100,11 +107,11 @@ def _walks(policy: Greedy, pool: MapPool) -> jax.Array:
     seen, states = jax.vmap(lambda dig, at: env.reset(key, MapParams(MapPool(dig[None], at[None]))))(pool.dig, pool.starts)
     most = MOST * jnp.sum(pool.dig, axis=(1, 2))
 
-    def going(carry: Any) -> jax.Array:
+    def going(carry: _Carry) -> jax.Array:
         _, _, steps, number = carry
         return jnp.any((steps == 0) & (number < most))
 
-    def one(carry: Any) -> Any:
+    def one(carry: _Carry) -> _Carry:
         seen, states, steps, number = carry
         action = policy.act(seen, jax.vmap(env.legal, (0, None))(states, MapParams()))
         seen, states, _, over, _, _ = jax.vmap(env.step_env, (None, 0, 0, None))(key, states, action, MapParams())
@@ -132,11 +139,11 @@ def _beams(policy: Greedy, pool: MapPool, width: int) -> jax.Array:
         dug = jax.nn.one_hot(jnp.full(width, first), dig.size, dtype=bool)
         most = MOST * jnp.sum(dig)
 
-        def going(carry: Any) -> jax.Array:
+        def going(carry: _Beam) -> jax.Array:
             _, _, _, steps, number = carry
             return (steps == 0) & (number < most)
 
-        def step(carry: Any) -> Any:
+        def step(carry: _Beam) -> _Beam:
             dug, place, alive, _, number = carry
             new = to[place].ravel()
             legal = (alive[:, None] & on[place]).ravel() & dig[new]

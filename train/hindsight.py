@@ -26,13 +26,14 @@ from jaxsand.bench.stroke_goals import CELLS, SPACING, usual_scene
 from jaxsand.goals.layout import right, strokes_right
 from jaxsand.goals.metrics import iou
 from jaxsand.planning.learned.beam_search import one_after_the_other
-from jaxsand.planning.learned.network import StrokeNet, ends, judge, likeliest, spread
+from jaxsand.planning.learned.network import Params, StrokeNet, ends, judge, likeliest, spread
 from jaxsand.planning.learned.policy import Policy, in_batches
 from jaxsand.scene.scene import Scene, blade_of
 from train.lessons import Lessons, lessons, way
 from train.plans import MOST, random_plans
 from train.sand import other_scene, starts
 
+_Learned = tuple[Params, Params, optax.OptState]  # parameters, their moving average, the optimiser's state
 _WEIGHT = 2.0  # of the loss of pairs: are they due
 _ENDS = 4.0  # and how far are their ends off (cells)
 _HUBER = 0.05  # cells
@@ -48,9 +49,9 @@ class Progress:
     the seed.
     """
 
-    params: Any
-    average: Any
-    optimiser: Any
+    params: Params
+    average: Params
+    optimiser: optax.OptState
     chunk: jax.Array
     seed: jax.Array
 
@@ -145,14 +146,14 @@ def _optimiser() -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(), optax.add_decayed_weights(1e-4))
 
 
-def _choose(net: StrokeNet, params: Any, depth: float, goal: np.ndarray, current: np.ndarray) -> np.ndarray:
+def _choose(net: StrokeNet, params: Params, depth: float, goal: np.ndarray, current: np.ndarray) -> np.ndarray:
     """The likeliest strokes [B, 4] (m) from a single view of the maps, which is good enough to learn from."""
     (strokes,) = in_batches(partial(_act, net, params), goal / depth, current / depth, (64,))
     return strokes * SPACING
 
 
 @partial(jax.jit, static_argnames="net")
-def _act(net: StrokeNet, params: Any, goal: jax.Array, current: jax.Array) -> tuple[jax.Array]:
+def _act(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Array) -> tuple[jax.Array]:
     scores: Any = net.apply(params, goal, current, method="look")
     return (likeliest(judge(net, params), scores, 1)[0][:, 0],)
 
@@ -222,20 +223,20 @@ def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> Labels:
 @partial(jax.jit, static_argnames="learner")
 def _learn(
     learner: Hindsight,
-    learned: Any,
+    learned: _Learned,
     chunk: int,
     key: int,
     goal: jax.Array,
     current: jax.Array,
     due: jax.Array,
     counts: jax.Array,
-) -> tuple[Any, jax.Array]:
+) -> tuple[_Learned, jax.Array]:
     """One step of gradient descent on a batch: the new parameters, their average and the optimiser's state, and the loss."""
     params, average, state = learned
     pairs = _pairs(jax.random.key(key), due)
     label = _labels(pairs, due, counts)
 
-    def loss(params: Any) -> jax.Array:
+    def loss(params: Params) -> jax.Array:
         made: Any = learner.net.apply(params, goal, current, pairs)
         scores, lines = made
         share = counts / jnp.sum(counts, 1, keepdims=True)

@@ -1,13 +1,12 @@
 """The networks of DDPG: an actor and a critic that read observations as one vector, or as maps."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-Observation = Any
+Observation = jax.Array | dict[str, jax.Array]
 """A vector [B, N], or a dictionary of maps [B, H, W], one of them the "goal" and one "current"."""
 
 _SMALL = nn.initializers.variance_scaling(1e-3, "fan_in", "uniform")  # of last layers: actions and values begin near 0

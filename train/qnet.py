@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from train.nets import Observation
+
 
 @dataclass(frozen=True)
 class Mean:
@@ -76,7 +78,7 @@ class QNet(nn.Module):
     blocks: int
 
     @nn.compact
-    def __call__(self, observation: Any) -> jax.Array:
+    def __call__(self, observation: Observation) -> jax.Array:
         x = nn.relu(nn.Dense(self.width)(self.look(observation)))
         for _ in range(self.blocks):
             y = nn.relu(nn.Dense(self.width)(nn.LayerNorm()(x)))
@@ -92,14 +94,14 @@ class Greedy:
     """A network with its parameters; it acts by the legal action of the highest value."""
 
     net: QNet = field(metadata={"static": True})
-    params: Any
+    params: optax.Params
 
-    def values(self, observation: Any) -> jax.Array:
+    def values(self, observation: Observation) -> jax.Array:
         """Action values [B, A] of observations [B, ...]."""
         raw: Any = self.net.apply(self.params, observation)
         return self.net.head.value(raw)
 
-    def act(self, observation: Any, legal: jax.Array) -> jax.Array:
+    def act(self, observation: Observation, legal: jax.Array) -> jax.Array:
         """The legal action [B] of the highest value; `legal` is [B, A]."""
         return best(self.values(observation), legal)
 
@@ -114,7 +116,7 @@ def of(values: jax.Array, action: jax.Array) -> jax.Array:
     return jnp.take_along_axis(values, action[:, None], axis=1)[:, 0]
 
 
-def flat(observation: Any) -> jax.Array:
+def flat(observation: Observation) -> jax.Array:
     """All leaves of an observation side by side, [B, F]."""
     leaves = jax.tree.leaves(observation)
     return jnp.concatenate([jnp.asarray(x, jnp.float32).reshape(len(x), -1) for x in leaves], axis=1)

@@ -222,7 +222,7 @@ def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State,
     return load_state(out / _LAST, state) if (out / _LAST).exists() else (state, At())
 
 
-def _compare(config: dict[str, Any], learner: Any, seed: int, out: Path) -> None:
+def _compare(config: dict[str, Any], learner: object, seed: int, out: Path) -> None:
     """Raises ValueError unless a run goes on with the configuration and the seed that it began with."""
     for field, have, want in _differences(config["learner"], learner, "learner"):
         raise ValueError(f"{field}: the run in {out} has {have}, got {want}; choose another folder, or give it the same")
@@ -230,7 +230,7 @@ def _compare(config: dict[str, Any], learner: Any, seed: int, out: Path) -> None
         raise ValueError(f"seed: the run in {out} has {config['seed']}, got {seed}; choose another folder, or give it that")
 
 
-def _differences(have: Any, want: Any, field: str) -> Iterator[tuple[str, Any, Any]]:
+def _differences(have: object, want: object, field: str) -> Iterator[tuple[str, object, object]]:
     """The fields in which two configurations differ, with both values."""
     if isinstance(have, dict) and isinstance(want, dict):
         for name in dict.fromkeys([*have, *want]):

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +43,7 @@ class Strokes:
         reward = jnp.sqrt(jnp.sum((goal - before) ** 2)) - jnp.sqrt(jnp.sum((goal - after) ** 2))
         return reward, jnp.zeros((), bool)
 
-    def most(self, observation: Any) -> jax.Array:
+    def most(self, observation: dict[str, jax.Array]) -> jax.Array:
         """An upper bound [B] of every value: with rewards L_t - L_{t+1}, L >= 0 and a discount g <= 1,
 
         sum_t g^t (L_t - L_{t+1}) = L_0 - (1 - g) sum_t g^t L_{t+1} <= L_0.
@@ -79,7 +78,7 @@ class Probing:
         """No reward and no end, since a probe has no goals."""
         return jnp.zeros(()), jnp.zeros((), bool)
 
-    def most(self, observation: Any) -> jax.Array:
+    def most(self, observation: jax.Array) -> jax.Array:
         """No bound, [B]."""
         return jnp.full(len(observation), jnp.inf, observation.dtype)
 
