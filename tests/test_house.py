@@ -70,6 +70,17 @@ def test_public_functions_say_what_they_do():
         assert getattr(jaxsand, name).__doc__, name
 
 
+def test_nothing_tells_to_run_the_learners_without_saying_where_they_are():
+    """`pip install jaxsand` has no `train`: who is told to run it must be told that a checkout of the repository has it."""
+    told = 0
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and "python -m train" in node.value:
+                told += 1
+                assert "checkout" in node.value, f"{path}: {node.value}"
+    assert told
+
+
 def test_the_readme_runs():
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
     assert blocks

@@ -1,1 +1,1 @@
-"""Learners that shape sand. Runs from a checkout: `python -m train --help`."""
+"""Learners that shape sand. They run from a checkout of the repository: `python -m train --help`."""

@@ -1,9 +1,8 @@
-"""The command line of the learners: `python -m train --help`. Mistakes end as those of `jaxsand` do."""
+"""The command line of the learners: `python -m train --help`. Wrong arguments end as those of `jaxsand` do."""
 
 import argparse
 import math
 import sys
-from typing import Any
 
 from jaxsand.cli.arguments import Parser, count, draw_without_a_screen, ended, keep_compiled_programs, path_name, seed, width
 from train.commands import MINUTES, SHIPPED, run_evaluation, run_shipping, run_training
@@ -21,7 +20,7 @@ _ABOUT = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
+    """Runs one command and returns its exit code; wrong arguments raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
     draw_without_a_screen()
     keep_compiled_programs()
@@ -38,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _training(commands: Any, learner: str) -> None:
+def _training(commands: "argparse._SubParsersAction[Parser]", learner: str) -> None:
     p = commands.add_parser(learner, help=_ABOUT[learner], description=f"Trains {_ABOUT[learner]}.")
     end = p.add_mutually_exclusive_group()
     of_paper = ", or 10,000 episodes with --paper" if learner == "ddpg" else ""
@@ -54,7 +53,7 @@ def _training(commands: Any, learner: str) -> None:
     p.set_defaults(command=run_training, learner=learner, paper=False)
 
 
-def _evaluation(commands: Any) -> None:
+def _evaluation(commands: "argparse._SubParsersAction[Parser]") -> None:
     p = commands.add_parser("evaluate", help="how many glyphs, or for dqn letter maps, a run gets right")
     p.add_argument("run", metavar="RUN|pretrained", help="folder of a run, whose best state is used, or what jaxsand ships")
     which = p.add_mutually_exclusive_group()
@@ -69,7 +68,7 @@ def _evaluation(commands: Any) -> None:
     p.set_defaults(command=run_evaluation)
 
 
-def _shipping(commands: Any) -> None:
+def _shipping(commands: "argparse._SubParsersAction[Parser]") -> None:
     p = commands.add_parser("ship", help="make the best policy of a hindsight run the one that jaxsand comes with")
     p.add_argument("run", type=path_name, metavar="RUN", help="folder of the run")
     p.add_argument("--out-file", type=path_name, default=SHIPPED, metavar="FILE.npz", help="another place for it")

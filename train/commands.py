@@ -1,16 +1,21 @@
-"""What the commands of `train` do."""
+"""The commands of `train`."""
 
 import argparse
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jaxsand
 from jaxsand.bench.tables import as_table
 from jaxsand.cli.files import existing, folder, progress, write_json, written
 from jaxsand.cli.printing import lines, show
+
+if TYPE_CHECKING:
+    from jaxsand.planning.learned.beam_search import Proposes
+    from train.dqn.learner import Dqn, Walking
+    from train.runs.runs import Learner
 
 MINUTES = {"hindsight": 30.0, "dqn": 10.0, "ddpg": 10.0}
 """How long each learner trains unless it is told."""
@@ -26,11 +31,11 @@ _POLISH = 4_000  # calls of the simulator for --refine
 
 
 class Stopped(KeyboardInterrupt):
-    """A run was asked to stop, and did."""
+    """A run was asked to stop, and has stopped."""
 
 
 def run_training(options: argparse.Namespace) -> None:
-    """Trains one learner, and says where it is and what it reached."""
+    """Trains one learner, and reports where the run is and the best score."""
     if options.tensorboard:
         _tensorboard_writer()
     tell = progress()
@@ -55,7 +60,7 @@ def run_training(options: argparse.Namespace) -> None:
 
 
 def run_evaluation(options: argparse.Namespace) -> None:
-    """How many glyphs, or letter maps, a run's best state gets right."""
+    """Reports how many glyphs, or letter maps, a run's best state gets right."""
     tell = progress()
     tell("getting ready")
     out = folder(options.out) if options.out else None
@@ -77,7 +82,7 @@ def run_evaluation(options: argparse.Namespace) -> None:
 
 
 def run_shipping(options: argparse.Namespace) -> None:
-    """Writes a run's best policy where jaxsand looks for it, with how it was made."""
+    """Writes a run's best policy into the package, with notes on how it was made."""
     from jaxsand.planning.learned.policy import save_policy
     from train.imitation.hindsight import Hindsight
     from train.runs.runs import about_run, learner_of, load, seed_of
@@ -86,7 +91,7 @@ def run_shipping(options: argparse.Namespace) -> None:
     if not isinstance(learner, Hindsight):
         raise ValueError(f"run: got one of {learner.name}; jaxsand ships what hindsight learned")
     at, seed = about_run(options.run), seed_of(options.run)
-    about = {
+    about: dict[str, float | str] = {
         "command": f"python -m train hindsight --seed {seed} --steps {at.chunk}",
         "seed": seed,
         "chunks": at.chunk,
@@ -99,8 +104,8 @@ def run_shipping(options: argparse.Namespace) -> None:
     show(options, {"file": str(options.out_file), "bytes": options.out_file.stat().st_size, **about}, lines)
 
 
-def _learner(options: argparse.Namespace) -> tuple[Any, int | None]:
-    """The learner, and after how many chunks it ends by itself.
+def _learner(options: argparse.Namespace) -> tuple["Learner", int | None]:
+    """The learner, and the number of chunks after which it ends by itself, if any.
 
     Raises:
       ValueError: if a package that it needs is missing.
@@ -111,7 +116,8 @@ def _learner(options: argparse.Namespace) -> tuple[Any, int | None]:
         raise ValueError(f"{options.learner}: {error.name} is not there; run pip install 'jaxsand[train]'") from None
 
 
-def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
+def _made(options: argparse.Namespace) -> tuple["Learner", int | None]:
+    """The learner, and the number of chunks after which it ends by itself, if any."""
     if options.learner == "hindsight":
         from train.imitation.hindsight import Hindsight
 
@@ -126,7 +132,10 @@ def _made(options: argparse.Namespace) -> tuple[Any, int | None]:
     return (paper, None if options.minutes else paper.chunks(EPISODES)) if options.paper else (Ddpg(), None)
 
 
-def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None) -> dict[str, Any]:
+def _on_sand(
+    policy: "Proposes", options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
+) -> dict[str, Any]:
+    """Evaluates a policy on glyphs, and writes report and picture if asked."""
     from jaxsand.planning.learned.stages import Stages
     from train.evaluation.glyphs import SETS, read_glyphs
     from train.evaluation.scores import evaluate, picture
@@ -146,8 +155,9 @@ def _on_sand(policy: Any, options: argparse.Namespace, tell: Callable[[str], Non
 
 
 def _on_maps(
-    learner: Any, state: Any, options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
+    learner: "Dqn", state: "Walking", options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
 ) -> dict[str, Any]:
+    """Evaluates a DQN on letter maps, and writes the report if asked."""
     for option in ("glyphs", "goals", "refine"):
         if getattr(options, option):
             raise ValueError(f"{option}: has an effect on strokes only, and dqn walks over maps; leave it out")
@@ -160,7 +170,7 @@ def _on_maps(
 
 
 def _evaluated(report: dict[str, Any]) -> str:
-    """A row for every glyph or map, then the sums."""
+    """The report as a table with a row for every glyph or map, and the sums."""
     kind = "glyphs" if "glyphs" in report else "maps"
     rows = [{"name": name, **row} for name, row in report[kind].items()]
     table = as_table([{k: v for k, v in row.items() if k != "pushes"} for row in rows], kind)
@@ -169,7 +179,9 @@ def _evaluated(report: dict[str, Any]) -> str:
 
 @contextmanager
 def _watch(out: Path, wanted: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """What is told of every row of a run's metrics: nothing, or a TensorBoard writer."""
+    """A function that is called with every row of a run's metrics: it writes them for TensorBoard if wanted, else does
+    nothing.
+    """
     if not wanted:
         yield lambda _: None
         return

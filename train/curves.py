@@ -20,7 +20,7 @@ _COUNTS = ("pushes", "steps")  # what a chunk's row counts, by the learner
 
 
 def curve(run: Path) -> dict[str, np.ndarray]:
-    """The validations of a run: minutes, what was simulated up to then, and the score.
+    """Reads a run's validations: minutes, strokes or steps simulated up to then, and score.
 
     Raises:
       ValueError: when the folder holds no metrics, or others.
@@ -45,7 +45,7 @@ def curve(run: Path) -> dict[str, np.ndarray]:
 
 
 def curves_figure(curves: dict[str, dict[str, np.ndarray]]) -> "Figure":
-    """A line for each run, against wall time and against what was simulated."""
+    """Score against wall time and against what was simulated, a line for each run."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3.6), layout="constrained")
@@ -63,6 +63,7 @@ def curves_figure(curves: dict[str, dict[str, np.ndarray]]) -> "Figure":
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """Draws the curves of runs; returns the exit code."""
     parser = Parser(prog="python -m train.curves", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", type=path_name, nargs="+", metavar="RUN")
     parser.add_argument("--out", type=path_name, required=True, metavar="FILE.png")

@@ -40,7 +40,7 @@ PUBLISHED = [
 
 @dataclass(frozen=True)
 class PeerGoal:
-    """A `goal` map [H, W] (m) of level sand with a shape dug out of it, and the scene."""
+    """A goal: level sand with a shape dug out of it, `goal` [H, W] (m), and its scene."""
 
     name: str
     scene: Scene
@@ -48,7 +48,7 @@ class PeerGoal:
 
 
 def peer_goals(number: int, key: int) -> list[PeerGoal]:
-    """Rectangles, L shapes and polygons in turn, somewhere on the bed."""
+    """Rectangles, L shapes and polygons in turn, at random places of the bed."""
     rng = np.random.default_rng(key)
     makers = {"rectangle": _rectangle, "L": _corner, "polygon": _polygon}
     out = []
@@ -82,7 +82,7 @@ def _polygon(rng: np.random.Generator) -> np.ndarray:
 
 
 def methods(most: int, pushes: int, key: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
-    """What finds strokes [N, 4] (m), at most so many; gradients and the search at a cost of about so many pushes."""
+    """Methods that find strokes [N, 4] (m), at most `most`; gradients and the search cost about `pushes` pushes."""
     policy = load_policy()
     return {
         "policy, looking ahead": lambda s: plan_by_policy(policy, s, most, Stages(width=6)).strokes,
@@ -93,8 +93,11 @@ def methods(most: int, pushes: int, key: int) -> dict[str, Callable[[SandLoss], 
 
 
 def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:
-    """Over the goal's cells: the mean height difference (mm), before and after; the share (%) that changed by more than a
-    tenth of the depth. And the mean difference (mm) over the whole bed, berms too."""
+    """The figures of a result.
+
+    Over the goal's cells: the mean height difference (mm) after and before, and the share (%) that changed by more than a
+    tenth of the depth. And the mean difference (mm) over the whole bed, berms too.
+    """
     dig = goal.goal < 0
     depth = -float(goal.goal.min())
     return {
@@ -108,10 +111,10 @@ def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:
 def compare(
     number: int, most: int, pushes: int, key: int, tell: Callable[[str], None], only: list[str] | None = None
 ) -> list[dict[str, Any]]:
-    """A row for each method, means over the goals, and the published figures.
+    """A row for each method with means over the goals, and the published figures.
 
     Raises:
-      ValueError: for a method that there is not.
+      ValueError: for a method that does not exist.
     """
     found = methods(most, pushes, key)
     for name in only or ():
@@ -134,6 +137,7 @@ def compare(
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """Compares the methods and prints the table; returns the exit code."""
     parser = Parser(prog="python -m train.peer", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--goals", type=count, default=12, metavar="N", help="goals (12)")
     parser.add_argument(

@@ -1,8 +1,8 @@
-"""Stable-Baselines3 on jaxsand: DDPG with hindsight, from its own library, on the many strokes.
+"""Stable-Baselines3 on jaxsand: its own DDPG with hindsight, on many strokes.
 
     python -m train.sb3 [--steps N] [--seed K] [--json]
 
-A check that the environment is what others expect, and what one stroke after the other costs in their loop. Needs the extra
+It checks that the environment is what other libraries expect, and measures strokes a second in their loop. Needs the extra
 `sb3`: pip install 'jaxsand[sb3]'.
 """
 
@@ -36,10 +36,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def trained(steps: int, seed: int) -> dict[str, float]:
-    """What `steps` strokes of DDPG + HER do, and how long they take; the environment's compilation apart.
+    """Trains for `steps` strokes, and measures rewards and run times without the environment's compilation.
 
     Raises:
-      ValueError: if Stable-Baselines3 is missing, or for fewer strokes than an episode has.
+      ValueError: if Stable-Baselines3 is missing, or for fewer strokes than two episodes have.
     """
     try:
         from stable_baselines3 import DDPG, HerReplayBuffer
@@ -81,7 +81,7 @@ def trained(steps: int, seed: int) -> dict[str, float]:
 
 
 def _mean_reward(agent: Any, env: Any, seed: int) -> float:
-    """What an episode earns without noise, on the same goals every time."""
+    """The mean reward of an episode without noise, on the same goals every time."""
     earned = 0.0
     for episode in range(_JUDGED):
         obs, _ = env.reset(seed=1_000 * (seed + 1) + episode)

@@ -1,13 +1,15 @@
-"""Environments for learners: a goal and the sand are shown, an action moves the tool.
+"""Environments for reinforcement learning: an agent sees a goal and the sand, and its actions move the tool.
 
-The state of an episode is apart from the parameters, whose leaves may be vmapped; see `episode.Environment`.
+They follow the protocol of gymnax 1.x: an environment is a static object, the state of an episode is apart from the
+parameters, and the leaves of both may be vmapped; see `episode.Environment`.
 """
 
-from dataclasses import fields
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import Field, fields
+from typing import Any, Literal, overload
 
 from jaxsand.envs.checks import check_kinds, check_limit, check_ready_goals, check_scene
-from jaxsand.envs.library import Level, RandomStrokes, Rough, library
+from jaxsand.envs.library import Goals, Level, RandomStrokes, Rough, library
 from jaxsand.envs.maps import MapPool, Walks, map_pool, pool_of
 from jaxsand.envs.multi import (
     LevelGoals,
@@ -65,25 +67,59 @@ __all__ = [
 _SHAPE, _SPACING, _WINDOW = (32, 32), 0.01, (12, 12)
 
 
+@overload
+def make(name: Literal["single-stroke"], *, on: OnSand, **options: Any) -> tuple[OnSand, SandParams]: ...
+
+
+@overload
+def make(name: Literal["single-stroke"], *, on: OnMap | None = None, **options: Any) -> tuple[OnMap, MapParams]: ...
+
+
+@overload
+def make(name: Literal["multi-stroke"], **options: Any) -> tuple[MultiStroke, StrokeParams]: ...
+
+
+@overload
+def make(name: str, **options: Any) -> tuple[Any, Any]: ...
+
+
 def make(name: str, **options: Any) -> tuple[Any, Any]:
-    """An environment and its parameters, after the protocol of gymnax 1.x.
+    """Makes an environment and its parameters, after the protocol of gymnax 1.x.
 
         obs, state = env.reset(key, params)
         obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
 
     `step` begins a new episode where one ended: the observation is then the new one's, and info["final_observation"] the
-    last of the old one; `step_env` does not. All of it works on one environment: use jax.vmap, over params too.
+    last of the old one. `step_env` does not begin anew. Both work on one environment; use `jax.vmap` for many, over params
+    too.
 
-    "single-stroke": `on` is an `OnMap()` (a binary map, the default) or an `OnSand()` (the simulator); the rest are fields
-    of the params: `goals` a `Walks()` or a pool of maps (`map_pool`, `pool_of`), `step_cost`, `limit`, on sand the `scene`.
+    Args:
+      name: "single-stroke", a walk of the tool over the cells of a binary map, or "multi-stroke", straight pushes from
+        anywhere to anywhere.
+      **options: for "single-stroke": `on`, `OnMap()` (a binary map, the default) or `OnSand()` (the simulator); `goals`, a
+        `Walks()` or a `MapPool` (see `map_pool`, `pool_of`); `step_cost`; `limit`, steps after which an episode is
+        truncated; and, with `OnSand()`, the `scene`. For "multi-stroke": the fields of `MultiStroke`; `goals`, a
+        `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, or maps [G, H, W] (m), such as
+        `jaxsand.task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no berms);
+        `starts`, a `Level()` or `Rough(relief)`; `seed`, for both; `scene`, by default 32 x 32 cells of 0.01 m with the
+        default blade, and a window of 12 x 12 cells that is computed around the blade while it is down; `limit`, strokes
+        after which an episode is truncated.
 
-    "multi-stroke": the fields of `MultiStroke`; `goals` a `RandomStrokes()`, glyphs {name: strokes of the unit square}, or
-    maps [G, H, W] (m), such as `task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no
-    berms); `starts` a `Level()` or `Rough(relief)`; a `seed` for both; `scene` and `limit`. The default scene is the
-    glyphs', and computes a window of 12 x 12 cells around the blade while it is down.
+    Returns:
+      The environment, static and hashable, and its parameters, a pytree.
 
     Raises:
-      ValueError: for a name or an option that there is not.
+      ValueError: for a name or an option that does not exist, or a value that is out of range.
+
+    Example:
+      >>> env, params = js.make("single-stroke", limit=20)
+      >>> obs, state = env.reset(jax.random.key(0), params)
+      >>> obs["goal"].shape, obs["goal"].dtype
+      ((7, 7), dtype('float32'))
+      >>> east = 1
+      >>> obs, state, reward, terminated, truncated, info = env.step(jax.random.key(1), state, east, params)
+      >>> int(state.time)
+      1
     """
     match name:
         case "single-stroke":
@@ -93,7 +129,10 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
     raise ValueError(f"name: got {name!r}; give single-stroke or multi-stroke")
 
 
-def _single(on: OnMap | OnSand | None = None, scene: Scene | None = None, **params: Any) -> tuple[Any, Any]:
+def _single(
+    on: OnMap | OnSand | None = None, scene: Scene | None = None, **params: Any
+) -> tuple[OnMap, MapParams] | tuple[OnSand, SandParams]:
+    """The single stroke with the given options."""
     env = OnMap() if on is None else on
     _known("single-stroke", params, fields(MapParams))
     check_kinds({"on": env, **params})
@@ -114,8 +153,13 @@ def _single(on: OnMap | OnSand | None = None, scene: Scene | None = None, **para
 
 
 def _multi(
-    goals: Any = None, starts: Level | Rough | None = None, scene: Scene | None = None, seed: int = 0, **options: Any
-) -> tuple[Any, Any]:
+    goals: Goals | LevelGoals | RoughGoals | None = None,
+    starts: Level | Rough | None = None,
+    scene: Scene | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> tuple[MultiStroke, StrokeParams]:
+    """Many strokes with the given options."""
     own = {f.name for f in fields(MultiStroke)}
     chosen = {key: value for key, value in options.items() if key in own}
     check_kinds(chosen)
@@ -136,7 +180,8 @@ def _multi(
     return env, StrokeParams(scene, goals, **params)
 
 
-def _known(name: str, options: dict[str, Any], some: Any) -> None:
+def _known(name: str, options: Mapping[str, object], some: Iterable[Field[Any]]) -> None:
+    """Raises ValueError for an option that is none of the fields in `some`."""
     names = [f.name for f in some]
     for option in options:
         if option not in names:

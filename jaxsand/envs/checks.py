@@ -1,5 +1,6 @@
-"""What `make` is given, looked at before anything is computed from it."""
+"""Checks of what `make` is given, before anything is computed from it."""
 
+from collections.abc import Mapping
 from typing import Any, get_args
 
 import numpy as np
@@ -23,8 +24,8 @@ _KINDS: dict[str, Any] = {
 }
 
 
-def check_kinds(options: dict[str, Any]) -> None:
-    """Raises ValueError for an option that is none of the kinds there are."""
+def check_kinds(options: Mapping[str, object]) -> None:
+    """Raises ValueError for an option whose value is of the wrong type."""
     for name, value in options.items():
         kind = _KINDS.get(name)
         if kind is not None and not isinstance(value, kind):
@@ -32,23 +33,23 @@ def check_kinds(options: dict[str, Any]) -> None:
             raise ValueError(f"{name}: got {value!r:.60}; give one of {kinds}")
 
 
-def check_limit(options: dict[str, Any]) -> None:
-    """Raises ValueError for a limit below one; a traced one is let through."""
+def check_limit(options: Mapping[str, object]) -> None:
+    """Raises ValueError for a limit below one; a traced limit is not checked."""
     if "limit" in options:
         limit = concrete(options["limit"])
         if limit is not None and not np.all(limit >= 1):
             raise ValueError(f"limit: got {options['limit']!r}; give 1 step or more to an episode")
 
 
-def check_scene(scene: Any) -> None:
+def check_scene(scene: object) -> None:
     """Raises ValueError unless it is a scene whose tool is a blade."""
     if not isinstance(scene, Scene):
         raise ValueError(f"scene: got {scene!r:.60}; give make_scene(..., tool=Blade())")
     blade_of(scene)
 
 
-def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: Any) -> None:
-    """Raises ValueError for maps of another shape than the scene's, and for starts that they would not begin from."""
+def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: object) -> None:
+    """Raises ValueError for goals that are not of the scene's shape, or with `starts` beside goals that have their own."""
     if goals.goals.shape[-2:] != scene.grid.shape:
         raise ValueError(f"goals: got maps of {list(goals.goals.shape[-2:])}, the scene has {list(scene.grid.shape)} cells")
     if starts is not None:

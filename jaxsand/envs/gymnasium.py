@@ -1,4 +1,4 @@
-"""Gymnasium's interface to the environments: import this module, then `gymnasium.make` or `gymnasium.make_vec`.
+"""Gymnasium's interface to the environments: import this module, then use `gymnasium.make` or `gymnasium.make_vec`.
 
     import gymnasium
     import jaxsand.gym
@@ -6,15 +6,15 @@
     env = gymnasium.make("jaxsand/MultiStroke-v0", render_mode="rgb_array")
     envs = gymnasium.make_vec("jaxsand/SingleStroke-v0", num_envs=64)
 
-Options are those of `jaxsand.make`. A vector of environments is one vmapped program; it begins a new episode in the step
-that ends the old one (AutoresetMode.SAME_STEP: info["final_obs"] holds the old one's last observation). A single one does
-not begin anew by itself.
+Options are those of `jaxsand.make`. A vector of environments is one vmapped program. It begins a new episode in the step
+that ends the old one (AutoresetMode.SAME_STEP: info["final_obs"] holds the old one's last observation). A single environment
+does not begin anew by itself.
 
 Needs the extra `gym`: pip install 'jaxsand[gym]'.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any, ClassVar
 
@@ -25,8 +25,9 @@ from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
-from jaxsand.envs import Box, MultiStroke, OnMap, make
+from jaxsand.envs import Box, MultiStroke, OnMap, OnSand, make
 
 SINGLE, MULTI = "jaxsand/SingleStroke-v0", "jaxsand/MultiStroke-v0"
 _LOW, _LEVEL, _HIGH, _TOOL = (np.array(c, float) for c in ((30, 60, 130), (222, 196, 150), (110, 60, 20), (200, 30, 30)))
@@ -34,11 +35,11 @@ _PIXELS = 256  # along a panel of a picture, about
 _AT_HOME = os.getpid()  # the process that this module was imported in
 
 Obs = dict[str, Any]
+Core = OnMap | OnSand | MultiStroke
 
 
 def _refuse_forks() -> None:
-    """Raises RuntimeError in a process that was forked: JAX's threads are not there, and its first program would wait for
-    them without end."""
+    """Raises RuntimeError in a forked process: JAX's threads are missing there, and its first program would never return."""
     if os.getpid() != _AT_HOME:
         raise RuntimeError(
             "vectorization_mode: got processes that were forked, in which JAX does not run; give make_vec "
@@ -46,7 +47,7 @@ def _refuse_forks() -> None:
         )
 
 
-def _known(space: Any, actions: Any, shape: tuple[int, ...]) -> None:
+def _known(space: spaces.Space[Any], actions: ArrayLike, shape: tuple[int, ...]) -> None:
     """Raises ValueError for actions of another shape, and for a step that is none of the four."""
     try:
         given = np.asarray(actions)
@@ -59,10 +60,11 @@ def _known(space: Any, actions: Any, shape: tuple[int, ...]) -> None:
 
 
 class _Sand(gymnasium.Env):
-    """One environment: `core` and `params` as `jaxsand.make` gives them, and the `state` of its episode."""
+    """One environment: `core` and `params` as `jaxsand.make` gives them, and the `state` of the episode."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
     task: ClassVar[str]
+    core: Core
 
     def __init__(self, render_mode: str | None = None, **options: Any) -> None:
         _refuse_forks()
@@ -73,12 +75,14 @@ class _Sand(gymnasium.Env):
         self.shown: Obs = {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begins an episode; returns its first observation and the info."""
         super().reset(seed=seed, options=options)
         obs, self.state, about = _alone(self.core)[0](_key(self.np_random), self.params)
         self.shown = _arrays(obs)
         return _view(self.shown), _arrays(about)
 
-    def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        """Takes one action; returns observation, reward, terminated, truncated and info."""
         _known(self.action_space, action, self.action_space.shape or ())
         # No environment draws anything in a step: any key will do.
         out = _alone(self.core)[1](jax.random.key(0), self.state, np.asarray(action), self.params)
@@ -86,46 +90,83 @@ class _Sand(gymnasium.Env):
         self.shown = _arrays(obs)
         return _view(self.shown), float(reward), bool(terminated), bool(truncated), _arrays(info)
 
-    def render(self) -> Any:
-        """A picture of goal and sand side by side, [height, width, 3] (uint8); None unless render_mode is rgb_array."""
+    def render(self) -> np.ndarray | None:
+        """A picture of goal and sand side by side, [height, width, 3] (uint8); None unless render_mode is "rgb_array"."""
         if self.render_mode is None:
             return None
         return picture(self.core, self.shown)
 
 
 class SingleStrokeEnv(_Sand):
-    """Observations are the planes "goal", "current" and "pose"; actions 0 to 3 are N, E, S, W, of which info["action_mask"]
-    says which lead on (`info["legal"]`: whether the last one did)."""
+    """The single stroke as a Gymnasium environment, "jaxsand/SingleStroke-v0".
+
+    Observations are the planes "goal", "current" (what is dug) and "pose" (where the tool stands). Actions 0 to 3 move the
+    tool north, east, south and west; info["action_mask"] says which of them lead to a cell of the goal, and info["legal"]
+    whether the last one did.
+
+    Args:
+      render_mode: "rgb_array" or None.
+      **options: those of `jaxsand.make("single-stroke", ...)`.
+
+    Example:
+      >>> env = js.gym.SingleStrokeEnv(limit=20)
+      >>> obs, info = env.reset(seed=0)
+      >>> obs["goal"].shape, env.action_space
+      ((7, 7), Discrete(4))
+    """
 
     task = "single-stroke"
 
 
 class MultiStrokeEnv(_Sand):
-    """Observations are "observation" and "achieved_goal", both the sand as it lies, and "desired_goal": maps [H, W] in units
-    of the blade's depth. An action holds x0, y0, x1, y1 from -1 to 1; numbers beyond push from off the map.
+    """Many strokes as a Gymnasium goal environment, "jaxsand/MultiStroke-v0".
 
-    The reward L_t - L_{t+1} depends on the map before the push, which is in info["previous"]: so who relabels goals must
-    keep the infos (Stable-Baselines3: replay_buffer_kwargs={"copy_info_dict": True}).
+    Observations are maps [H, W] in units of the blade's depth: "observation" and "achieved_goal", both the sand as it lies,
+    and "desired_goal". An action holds x0, y0, x1, y1 from -1 to 1, from the first to the last cell centre of the map;
+    numbers beyond that push from off the map.
+
+    The reward is L_t - L_{t+1}, with L = sqrt(sum (goal - h)^2). It depends on the map before the push, which is in
+    info["previous"]. So an algorithm that relabels goals must keep the infos (Stable-Baselines3:
+    replay_buffer_kwargs={"copy_info_dict": True}).
+
+    Args:
+      render_mode: "rgb_array" or None.
+      **options: those of `jaxsand.make("multi-stroke", ...)`.
+
+    Example:
+      >>> env = js.gym.MultiStrokeEnv(goals=np.zeros((1, 8, 8)), scene=js.make_scene((8, 8), 0.01, tool=js.Blade()))
+      >>> obs, info = env.reset(seed=0)
+      >>> obs["desired_goal"].shape, env.action_space.shape
+      ((8, 8), (4,))
     """
 
     task = "multi-stroke"
+    core: MultiStroke
 
-    def step(self, action: Any) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        """Pushes once; returns observation, reward, terminated, truncated and info."""
         previous = self.shown["current"]
         obs, _, terminated, truncated, info = super().step(action)
         info["previous"] = previous
         reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], info))
         return obs, reward, terminated, truncated, info
 
-    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
-        """The reward for having made `achieved_goal` [H, W] or [B, H, W] of info["previous"] when `desired_goal` was the
-        goal: a number, or [B] for B infos. Exactly that of `step` for the goal that was given.
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Obs | Sequence[Obs]) -> Any:
+        """The reward of a push for any goal, exactly as `step` computes it for the goal that was given.
+
+        Args:
+          achieved_goal: the map after the push, [H, W], or [B, H, W] for many.
+          desired_goal: the goal, of the same shape.
+          info: the info of the push, or B infos; info["previous"] is the map before the push.
+
+        Returns:
+          A number, or [B] for many.
 
         Raises:
           ValueError: if an info does not hold the map before the push.
         """
         single = np.ndim(achieved_goal) == 2
-        infos = [info] if single else list(info)
+        infos: list[Any] = [info] if single else list(info)
         if not all("previous" in one for one in infos):
             raise ValueError(
                 "info: got one without 'previous', the map before the push; keep the infos of `step` "
@@ -144,7 +185,22 @@ class MultiStrokeEnv(_Sand):
 
 
 class SandVectorEnv(VectorEnv):
-    """Many environments as one vmapped program; see the single ones."""
+    """Many environments as one vmapped program, for `gymnasium.make_vec`.
+
+    Observations and actions are those of `SingleStrokeEnv` or `MultiStrokeEnv`, with a first axis of length num_envs.
+
+    Args:
+      task: "single-stroke" or "multi-stroke".
+      num_envs: how many.
+      render_mode: "rgb_array" or None.
+      **options: those of `jaxsand.make`.
+
+    Example:
+      >>> envs = js.gym.SandVectorEnv("single-stroke", num_envs=3)
+      >>> obs, info = envs.reset(seed=0)
+      >>> obs["goal"].shape
+      (3, 7, 7)
+    """
 
     metadata: dict[str, Any] = _Sand.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
 
@@ -158,14 +214,15 @@ class SandVectorEnv(VectorEnv):
         self.shown: Obs = {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """With a seed, the i-th environment begins as a single one with `seed` + i does."""
+        """Begins an episode in each; with a seed, the i-th begins as a single environment with `seed` + i does."""
         super().reset(seed=seed, options=options)
         own = [self.np_random if seed is None else np_random(seed + i)[0] for i in range(self.num_envs)]
         obs, self.state, about = _together(self.core)[0](jax.numpy.stack([_key(one) for one in own]), self.params)
         self.shown = _arrays(obs)
         return _view(self.shown), _masked(_arrays(about), np.ones(self.num_envs, bool))
 
-    def step(self, actions: Any) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: ArrayLike) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Takes one action in each, and begins a new episode where one ended."""
         _known(self.single_action_space, actions, self.action_space.shape or ())
         keys = jax.random.split(_key(self.np_random), self.num_envs)
         out = _together(self.core)[1](keys, self.state, np.asarray(actions), self.params)
@@ -188,15 +245,29 @@ class SandVectorEnv(VectorEnv):
         self.shown = _arrays(obs)
         return _view(self.shown), reward.astype(float), terminated, truncated, infos
 
-    def render(self) -> Any:
-        """A picture of each environment; None unless render_mode is rgb_array."""
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture of each environment; None unless render_mode is "rgb_array"."""
         if self.render_mode is None:
             return None
         return tuple(picture(self.core, {name: x[i] for name, x in self.shown.items()}) for i in range(self.num_envs))
 
 
-def picture(core: Any, shown: Obs) -> np.ndarray:
-    """Goal and sand [height, width, 3] (uint8): blue is a blade's depth down, brown as far up, red where the tool stands."""
+def picture(core: Core, shown: Obs) -> np.ndarray:
+    """Draws goal and sand side by side: blue is a blade's depth down, brown as far up, red where the tool stands.
+
+    Args:
+      core: the environment, as `jaxsand.make` gives it.
+      shown: its observation, as numpy arrays.
+
+    Returns:
+      [height, width, 3] (uint8).
+
+    Example:
+      >>> env, params = js.make("single-stroke")
+      >>> planes = {name: np.zeros((7, 7)) for name in ("goal", "current", "pose")}
+      >>> js.gym.picture(env, planes).shape
+      (252, 540, 3)
+    """
     on_map = isinstance(core, OnMap)
     panels = [_coloured(-shown[name] if on_map else shown[name]) for name in ("goal", "current")]
     if "pose" in shown:
@@ -212,18 +283,20 @@ def picture(core: Any, shown: Obs) -> np.ndarray:
 
 
 def _renders(mode: str | None) -> str | None:
-    """The mode, if there is such a one."""
+    """The render mode; raises ValueError if it does not exist."""
     if mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode: got {mode!r}; give rgb_array or None")
     return mode
 
 
 def _coloured(height: np.ndarray) -> np.ndarray:
+    """Heights in units of the blade's depth as colours [H, W, 3]."""
     part = np.clip(height, -1, 1)[..., None]
     return _LEVEL + np.maximum(-part, 0) * (_LOW - _LEVEL) + np.maximum(part, 0) * (_HIGH - _LEVEL)
 
 
-def _spaces(core: Any, params: Any) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+def _spaces(core: Core, params: Any) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+    """Gymnasium's spaces of an environment's observations and actions."""
     shown, action = core.observation_space(params).spaces, core.action_space(params)
     observation = spaces.Dict(_view({name: _box(box) for name, box in shown.items()}))
     return observation, _box(action) if isinstance(action, Box) else spaces.Discrete(action.n)
@@ -234,7 +307,7 @@ def _box(box: Box) -> spaces.Box:
 
 
 def _view(shown: Obs) -> Obs:
-    """What the environment shows as Gymnasium's users know it: as a goal dictionary where strokes are free."""
+    """The observation under Gymnasium's names: a goal dictionary for many strokes."""
     if "pose" in shown:
         return dict(shown)
     return {"observation": shown["current"], "achieved_goal": shown["current"], "desired_goal": shown["goal"]}
@@ -244,8 +317,8 @@ def _arrays(tree: Obs) -> Obs:
     return {name: x if isinstance(x, dict) else np.asarray(x) for name, x in tree.items()}
 
 
-def _masked(info: dict[str, Any], which: np.ndarray) -> dict[str, Any]:
-    """What every environment has to say, with Gymnasium's mark of those for which it holds."""
+def _masked(info: Obs, which: np.ndarray) -> dict[str, Any]:
+    """Infos of all environments, with Gymnasium's mask of those for which they hold."""
     return info | {f"_{name}": which for name in info}
 
 
@@ -254,8 +327,8 @@ def _key(random: np.random.Generator) -> jax.Array:
 
 
 @cache
-def _programs(core: Any, step: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """`reset` and a step of one environment, with the mask of actions where it has one."""
+def _programs(core: Core, step: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """`reset` and a step of one environment, with the mask of actions in the info where it has one."""
 
     def about(state: Any, params: Any) -> Obs:
         return {} if isinstance(core, MultiStroke) else {"action_mask": core.legal(state, params).astype(np.int8)}
@@ -272,13 +345,15 @@ def _programs(core: Any, step: Any) -> tuple[Callable[..., Any], Callable[..., A
 
 
 @cache
-def _alone(core: Any) -> tuple[Any, Any]:
+def _alone(core: Core) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The compiled `reset` and step of one environment, which does not begin a new episode."""
     begin, go_on = _programs(core, type(core).step_env)
     return jax.jit(begin), jax.jit(go_on)
 
 
 @cache
-def _together(core: Any) -> tuple[Any, Any]:
+def _together(core: Core) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The compiled `reset` and step of many environments, which begin new episodes."""
     begin, go_on = _programs(core, type(core).step)
     return jax.jit(jax.vmap(begin, (0, None))), jax.jit(jax.vmap(go_on, (0, 0, 0, None)))
 

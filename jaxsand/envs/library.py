@@ -1,4 +1,4 @@
-"""Pools of goals for many strokes, made once: random strokes, glyphs, or height maps, on level or on rough sand."""
+"""Pools of goals for many strokes, made once: of random strokes, glyphs, or height maps, on level or on rough sand."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,8 +25,18 @@ _GLYPH_MAP = 0.32  # m: the side of the map that the glyphs' square is given for
 
 @dataclass(frozen=True)
 class RandomStrokes:
-    """So many goals of `fewest` to `most` random strokes in the glyphs' square, none shorter than a part of its side, up to
-    a half."""
+    """Tells `make` to use goals that random strokes leave, within the square in which glyphs lie.
+
+    Args:
+      goals: how many goals.
+      fewest, most: how many strokes make a goal.
+      shortest: the least length of a stroke, as a share of the square's side, up to a half.
+
+    Example:
+      >>> plans = js.env.RandomStrokes(goals=2, fewest=3, most=3).plans(np.random.default_rng(0))
+      >>> len(plans), plans[0].shape
+      (2, (3, 4))
+    """
 
     goals: int = 256
     fewest: int = 1
@@ -34,7 +44,7 @@ class RandomStrokes:
     shortest: float = 0.15
 
     def plans(self, rng: np.random.Generator) -> list[np.ndarray]:
-        """Strokes [n, 4] of the unit square for each goal."""
+        """Draws the strokes [n, 4] of the unit square for each goal."""
         if not (self.goals >= 1 and 1 <= self.fewest <= self.most and 0 <= self.shortest <= 0.5):
             raise ValueError(f"goals: got {self}; give one goal or more, 1 <= fewest <= most, and shortest from 0 to 0.5")
         drawn = rng.random((_TRIES, self.goals, self.most, 4))
@@ -47,12 +57,27 @@ class RandomStrokes:
 
 @dataclass(frozen=True)
 class Level:
-    """Sand level at height 0 (neutral)."""
+    """Tells `make` to begin from level sand at height 0, the default.
+
+    Example:
+      >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), starts=js.env.Level())
+      >>> params.goals.goals.shape
+      (1, 32, 32)
+    """
 
 
 @dataclass(frozen=True)
 class Rough:
-    """Random surfaces of a height range of `relief` (m) before they come to rest, smooth over `scale` cells."""
+    """Tells `make` to begin from random surfaces at rest.
+
+    Args:
+      relief: from the lowest to the highest point before the surface settles (m).
+      scale: over how many cells it is smooth.
+
+    Example:
+      >>> js.env.Rough(relief=0.02).scale
+      3.0
+    """
 
     relief: float = 0.01
     scale: float = 3.0
@@ -63,10 +88,26 @@ Goals = RandomStrokes | Mapping[str, Any] | np.ndarray | jax.Array
 
 
 def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough, seed: int) -> LevelGoals | RoughGoals:
-    """The pool that an environment draws its goals from; strokes are pushed as the environment pushes.
+    """Makes the pool of goals that an environment draws from; strokes are pushed as the environment pushes them.
+
+    Args:
+      env: the environment.
+      scene: grid, sand and blade.
+      goals: a `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, or maps [G, H, W] (m).
+      starts: `Level()` or `Rough()`.
+      seed: of all that is drawn.
+
+    Returns:
+      The goals as `LevelGoals`, or with the surfaces that they start from as `RoughGoals`.
 
     Raises:
-      ValueError: for goals that are none, or are not of the scene's shape.
+      ValueError: for goals of the wrong type, without any goal, or not of the scene's shape.
+
+    Example:
+      >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+      >>> pool = js.env.library(js.env.MultiStroke(), scene, np.zeros((2, 8, 8)), js.env.Level(), seed=0)
+      >>> pool.goals.shape
+      (2, 8, 8)
     """
     if not isinstance(starts, Level | Rough):
         raise ValueError(f"starts: got {starts!r}; give Level() or Rough()")
@@ -96,7 +137,7 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
 
 
 def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Maps [count, H, W] (m) at rest."""
+    """The surfaces [count, H, W] (m) to start from, at rest."""
     shape = (count, *scene.grid.shape)
     if isinstance(starts, Level):
         return np.zeros(shape, np.float32)
@@ -109,19 +150,19 @@ def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Ge
 
 
 def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray]) -> np.ndarray:
-    """What plans of strokes of the unit square leave of maps [G, H, W] (m)."""
+    """The maps [G, H, W] (m) after the strokes of each plan, which are given in the unit square."""
     side = min(scene.grid.shape) * float(scene.grid.spacing) / _GLYPH_MAP
     low, high = (edge * side for edge in task.GLYPH_SQUARE)
     push = _program(env.batching.pushing(env.push, env.settle))
     heights = jnp.asarray(maps)
     for k in range(max(map(len, plans))):
         strokes = np.stack([task.place(some[min(k, len(some) - 1)], (low, high)) for some in plans]).astype(np.float32)
-        after, _ = push(scene, heights, strokes)
+        after, _ = push(scene, heights, jnp.asarray(strokes))
         due = jnp.array([k < len(some) for some in plans]) & jnp.all(jnp.isfinite(after), axis=(1, 2))
         heights = jnp.where(due[:, None, None], after, heights)
     return np.asarray(heights)
 
 
 @cache
-def _program(pushing: Pushing) -> Any:
+def _program(pushing: Pushing) -> Pushing:
     return jax.jit(jax.vmap(pushing, in_axes=(None, 0, 0)))

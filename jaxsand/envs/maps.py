@@ -1,9 +1,8 @@
-"""Goals of the single stroke: binary maps with the cell where the tool starts, row 0 on top."""
+"""Goals of the single stroke: binary maps, row 0 on top, with the cell where the tool starts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +19,24 @@ STEPS = np.array([*MOVES.values()], np.int32)
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MapPool:
-    """Maps `dig` [G, H, W] (bool) with their `starts` [G, 2] (row, column); an episode takes any of them. See `map_pool`."""
+    """Binary maps with their starts; an episode draws one of them. `map_pool` and `pool_of` make pools.
+
+    Args:
+      dig: booleans [G, H, W], true where to dig, row 0 on top.
+      starts: (row, column) of the first cell, [G, 2].
+
+    Example:
+      >>> pool = js.env.map_pool([np.ones((2, 2), bool)])
+      >>> dig, start = pool.draw(jax.random.key(0), (2, 2))
+      >>> int(dig.sum())
+      4
+    """
 
     dig: jax.Array
     starts: jax.Array
 
     def draw(self, key: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
-        """A map [H, W] and its start [2]."""
+        """Draws a map [H, W] and its start [2]."""
         if self.dig.shape[-2:] != shape:
             raise ValueError(f"goals.dig: got maps of {list(self.dig.shape[-2:])} cells; the environment has {list(shape)}")
         i = jax.random.randint(key, (), 0, self.dig.shape[0])
@@ -36,11 +46,19 @@ class MapPool:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Walks:
-    """The cells of a new random walk of `shortest` to `longest` steps for every episode, which starts where the walk did.
+    """A new random walk for every episode: its cells are to be dug, and the tool starts where the walk did.
 
-    The walk goes straight on with probability `straight`, else turns left or right, and back only from a dead end.
+    The walk goes straight on with a given probability, else turns left or right, and back only from a dead end. A vmapped
+    `step` draws a walk at every step, whether or not an episode ends; `pool_of` draws many beforehand.
 
-    A vmapped `step` draws a walk at every step, whether or not an episode ends; `pool_of` draws many beforehand.
+    Args:
+      shortest, longest: steps of the walk.
+      straight: the probability to go straight on.
+
+    Example:
+      >>> dig, start = js.env.Walks(shortest=3, longest=3).draw(jax.random.key(0), (7, 7))
+      >>> bool(dig[start[0], start[1]])
+      True
     """
 
     shortest: jax.Array | int = 6
@@ -48,13 +66,13 @@ class Walks:
     straight: jax.Array | float = 0.75
 
     def draw(self, key: jax.Array, shape: tuple[int, int]) -> tuple[jax.Array, jax.Array]:
-        """A map [H, W] and its start [2]."""
+        """Draws a map [H, W] and its start [2]."""
         number, begin, walk = jax.random.split(key, 3)
         steps = jax.random.randint(number, (), self.shortest, jnp.asarray(self.longest) + 1)
         start = jax.random.randint(begin, (2,), 0, jnp.asarray(shape), jnp.int32)
         turns = jnp.array([self.straight, (1 - self.straight) / 2, 1e-6, (1 - self.straight) / 2], jnp.float32)
 
-        def one(k: jax.Array, carry: Any) -> Any:
+        def one(k: jax.Array, carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
             dig, place, heading = carry
             there = place[None] + STEPS
             on = jnp.all((there >= 0) & (there < jnp.asarray(shape, jnp.int32)[None]), axis=1)
@@ -73,15 +91,40 @@ MapGoals = MapPool | Walks
 
 @partial(jax.jit, static_argnames=("count", "shape"))
 def pool_of(goals: MapGoals, key: jax.Array, count: int, shape: tuple[int, int] = (7, 7)) -> MapPool:
-    """So many maps drawn beforehand: a reset that picks one costs next to nothing."""
+    """Draws many maps beforehand, so that a reset, which picks one of them, costs next to nothing.
+
+    Args:
+      goals: what draws the maps, such as `Walks()`.
+      key: a JAX key.
+      count: how many maps.
+      shape: of a map.
+
+    Returns:
+      A `MapPool`.
+
+    Example:
+      >>> js.env.pool_of(js.env.Walks(), jax.random.key(0), count=5).dig.shape
+      (5, 7, 7)
+    """
     return MapPool(*jax.vmap(lambda k: goals.draw(k, shape))(jax.random.split(key, count)))
 
 
 def map_pool(maps: Sequence[np.ndarray] | np.ndarray, starts: Sequence[Cell | None] | None = None) -> MapPool:
-    """Binary maps [H, W] of one shape (row 0 on top) with their starts (row, column); where there is none, the planner's.
+    """Makes a pool of given binary maps.
+
+    Args:
+      maps: booleans [H, W], all of one shape, true where to dig, row 0 on top.
+      starts: (row, column) of the first cell of each map; where it is None, or without starts, the planner chooses it.
+
+    Returns:
+      A `MapPool`.
 
     Raises:
       ValueError: for maps of different shapes, one that is empty or falls into pieces, or a start that is not to be dug.
+
+    Example:
+      >>> js.env.map_pool([np.ones((2, 3), bool)], starts=[(0, 1)]).starts.tolist()
+      [[0, 1]]
     """
     maps = [np.asarray(dig, bool) for dig in maps]
     if not maps or len({dig.shape for dig in maps}) > 1:

@@ -1,13 +1,13 @@
 """Many strokes: each action is a straight push from anywhere to anywhere on the map, after which the sand settles."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsand.envs import episode
-from jaxsand.envs.episode import Step
+from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.pushing import Batching, ByLength, Push
 from jaxsand.envs.spaces import Box, Dict
 from jaxsand.goals import metrics as task
@@ -18,7 +18,12 @@ from jaxsand.scene.scene import Scene, blade_of
 
 @dataclass(frozen=True)
 class NoStop:
-    """An episode goes on until it is truncated (neutral)."""
+    """Tells `MultiStroke` that an episode ends only when it is truncated, the default.
+
+    Example:
+      >>> js.env.MultiStroke().stop
+      NoStop()
+    """
 
     size = 4
 
@@ -30,7 +35,13 @@ class NoStop:
 
 @dataclass(frozen=True)
 class Stop:
-    """A fifth number above 0 ends the episode (terminated) in place of a push."""
+    """Tells `MultiStroke` that actions have a fifth number, which ends the episode in place of a push when it is above 0.
+
+    Example:
+      >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), stop=js.env.Stop())
+      >>> env.action_space(params).shape
+      (5,)
+    """
 
     size = 5
 
@@ -42,29 +53,50 @@ class Stop:
 
 @dataclass(frozen=True)
 class WithBerms:
-    """Maps are compared as they are (neutral): for goals that strokes made."""
+    """Tells `MultiStroke` to compare maps as they are, the default: for goals that strokes made.
 
-    def seen(self, height: jax.Array) -> jax.Array:
+    Example:
+      >>> float(js.env.WithBerms().seen(jnp.float32(2.0)))
+      2.0
+    """
+
+    def seen(self, height: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+        """The map as it is."""
         return height
 
 
 @dataclass(frozen=True)
 class OnlyDug:
-    """Maps are compared on what is dug, min(h, 0): for goals that are drawn, which hold no berms."""
+    """Tells `MultiStroke` to compare what is dug, min(h, 0): for goals that are drawn without berms.
 
-    def seen(self, height: jax.Array) -> jax.Array:
+    Example:
+      >>> float(js.env.OnlyDug().seen(jnp.float32(2.0)))
+      0.0
+    """
+
+    def seen(self, height: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+        """What is dug of the map."""
         return task.below(height)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LevelGoals:
-    """Goal maps `goals` [G, H, W] (m) for level sand; an episode takes any of them. See `library`."""
+    """Goals for level sand at height 0; an episode draws one of them. `library` makes them.
+
+    Args:
+      goals: maps [G, H, W] (m).
+
+    Example:
+      >>> start, goal = js.env.LevelGoals(jnp.ones((3, 8, 8))).draw(jax.random.key(0))
+      >>> float(start.max()), float(goal.min())
+      (0.0, 1.0)
+    """
 
     goals: jax.Array
 
     def draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """A map to start from and a goal [H, W] (m)."""
+        """Draws a map to start from and a goal, both [H, W] (m)."""
         goal = self.goals[jax.random.randint(key, (), 0, self.goals.shape[0])]
         return jnp.zeros_like(goal), goal
 
@@ -72,13 +104,23 @@ class LevelGoals:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class RoughGoals:
-    """Goal maps `goals` [G, H, W] (m), each with the map at rest that it starts from; an episode takes any of them."""
+    """Goals, each with the surface that it starts from; an episode draws one of them. `library` makes them.
+
+    Args:
+      goals: maps [G, H, W] (m).
+      starts: maps [G, H, W] (m), at rest.
+
+    Example:
+      >>> start, goal = js.env.RoughGoals(jnp.ones((3, 8, 8)), jnp.zeros((3, 8, 8))).draw(jax.random.key(0))
+      >>> float(start.max()), float(goal.min())
+      (0.0, 1.0)
+    """
 
     goals: jax.Array
     starts: jax.Array
 
     def draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """A map to start from and a goal [H, W] (m)."""
+        """Draws a map to start from and a goal, both [H, W] (m)."""
         i = jax.random.randint(key, (), 0, self.goals.shape[0])
         return self.starts[i], self.goals[i]
 
@@ -86,7 +128,18 @@ class RoughGoals:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class StrokeState:
-    """The `goal` and the `height` map [H, W] (m), and strokes so far."""
+    """The state of an episode of many strokes.
+
+    Attributes:
+      goal: [H, W] (m).
+      height: the sand as it lies, [H, W] (m).
+      time: strokes so far.
+
+    Example:
+      >>> state = js.env.StrokeState(jnp.zeros((8, 8)), jnp.zeros((8, 8)), jnp.int32(0))
+      >>> int(state.time)
+      0
+    """
 
     goal: jax.Array
     height: jax.Array
@@ -96,7 +149,18 @@ class StrokeState:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class StrokeParams:
-    """The `scene`, whose tool is a Blade, where `goals` come from, and after how many strokes an episode is truncated."""
+    """The parameters of `MultiStroke`; `jaxsand.make` makes them.
+
+    Args:
+      scene: grid, sand and a `Blade`.
+      goals: what an episode draws its goal and its start from.
+      limit: strokes after which an episode is truncated.
+
+    Example:
+      >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), limit=3)
+      >>> params.limit
+      3
+    """
 
     scene: Scene
     goals: LevelGoals | RoughGoals
@@ -105,19 +169,32 @@ class StrokeParams:
 
 @dataclass(frozen=True)
 class MultiStroke:
-    """An action holds x0, y0, x1, y1, each -1 to 1 from the first to the last cell centre of the map; numbers beyond that
-    push from off the map.
+    """An environment of straight pushes: each action is a stroke, after which the sand settles.
 
-    With L the l2 distance of goal and map, sqrt(sum (goal - h)^2), in units of the blade's depth, the reward is
-    L_t - L_{t+1}. An episode ends with its last stroke (truncated at `limit`), or when a `Stop` asks for it (terminated).
+    An action holds x0, y0, x1, y1, each from -1 to 1, from the first to the last cell centre of the map; numbers beyond that
+    push from off the map. Observations are the maps "goal" and "current" [H, W] in units of the blade's depth (float32).
 
-    Observations are the maps "goal" and "current" [H, W], in units of the blade's depth (float32). `info` holds the
-    simulator's "outcome"; a push that leaves no finite map leaves the map as it was.
+    With L = sqrt(sum (goal - h)^2), in units of the blade's depth, the reward is L_t - L_{t+1}. An episode is truncated
+    after `limit` strokes, and terminated when a `Stop` asks for it. `info` holds the simulator's "outcome"; a push that
+    leaves a map that is not finite changes nothing.
 
-    `push` is the full push or the fast one, `SwathPush()`; `settle` its stop rule, by default until still.
+    The reward is differentiable once, in forward and reverse mode, in the action, the state's maps and the scene's floats
+    (but not where the map equals the goal, nor in the fifth number of a `Stop`), whatever the batching.
 
-    A reward is differentiable once, in forward and reverse mode, in the action, the state's maps and the scene's floats (not
-    where the map is the goal to the last bit, nor in the fifth number of a `Stop`), whatever the batching.
+    Args:
+      push: `SteppedPush()` (the full push, the default) or `SwathPush()` (fast).
+      stop: `NoStop()` or `Stop()`.
+      measure: `WithBerms()` or `OnlyDug()`.
+      batching: `ByLength()` (for a CPU, the default) or `Together()` (for a GPU).
+      settle: when settling stops; None means when the sand is still.
+
+    Example:
+      >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)))
+      >>> obs, state = env.reset(jax.random.key(0), params)
+      >>> obs["current"].shape
+      (32, 32)
+      >>> bool(jnp.allclose(env.stroke(-jnp.ones(4), params), 0.005))
+      True
     """
 
     push: Push = field(default_factory=SteppedPush)
@@ -127,12 +204,19 @@ class MultiStroke:
     settle: StopRule | None = None
 
     def reset(self, key: jax.Array, params: StrokeParams) -> tuple[dict[str, jax.Array], StrokeState]:
+        """Begins an episode; returns its first observation and its state."""
         start, goal = params.goals.draw(key)
         state = StrokeState(goal, start, jnp.zeros((), jnp.int32))
         return self.observe(state, params), state
 
-    def step_env(self, key: jax.Array, state: StrokeState, action: Any, params: StrokeParams) -> Step:
-        """One stroke, without a new episode after the last; nothing is drawn from the key."""
+    def step_env(
+        self, key: jax.Array, state: StrokeState, action: Action, params: StrokeParams
+    ) -> Step[dict[str, jax.Array], StrokeState]:
+        """Makes one stroke, and does not begin a new episode after the last; nothing is drawn from the key.
+
+        Returns:
+          Observation, state, reward, terminated, truncated, info.
+        """
         del key
         action = jnp.asarray(action, state.height.dtype)
         if action.shape != (self.stop.size,):
@@ -154,12 +238,12 @@ class MultiStroke:
         return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def stroke(self, action: jax.Array, params: StrokeParams) -> jax.Array:
-        """The stroke x0, y0, x1, y1 (m) of an action [4] or longer."""
+        """The stroke x0, y0, x1, y1 (m) of an action."""
         cells, spacing = _cells(params).astype(action.dtype), jnp.asarray(params.scene.grid.spacing, action.dtype)
         return (0.5 + (action[:4] + 1) / 2 * cells) * spacing
 
     def action(self, stroke: jax.typing.ArrayLike, params: StrokeParams) -> jax.Array:
-        """The action of a stroke x0, y0, x1, y1 (m); with a `Stop`, one that goes on."""
+        """The action of a stroke x0, y0, x1, y1 (m); with a `Stop` its fifth number is -1, which goes on."""
         stroke = jnp.asarray(stroke)
         steps = stroke / jnp.asarray(params.scene.grid.spacing, stroke.dtype) - 0.5
         return jnp.concatenate(
@@ -167,18 +251,21 @@ class MultiStroke:
         )
 
     def observe(self, state: StrokeState, params: StrokeParams) -> dict[str, jax.Array]:
+        """The observation of a state."""
         maps = {"goal": state.goal, "current": state.height}
         return {name: (x / blade_of(params.scene).depth).astype(jnp.float32) for name, x in maps.items()}
 
     def action_space(self, params: StrokeParams) -> Box:
+        """The space of actions."""
         del params
         return Box(-1, 1, (self.stop.size,))
 
     def observation_space(self, params: StrokeParams) -> Dict:
+        """The space of observations."""
         return Dict({name: Box(-jnp.inf, jnp.inf, params.scene.grid.shape) for name in ("goal", "current")})
 
 
 def _cells(params: StrokeParams) -> jax.Array:
-    """Cells between the first and the last centre, for x0, y0, x1, y1."""
+    """The number of cells from the first to the last cell centre, for x0, y0, x1, y1."""
     rows, columns = params.scene.grid.shape
     return jnp.array([columns - 1, rows - 1, columns - 1, rows - 1])

@@ -1,16 +1,16 @@
 """The single stroke on a binary map: the tool stays down, and digs each cell that it comes to.
 
-The rules are the planner's: a walk over the goal's cells that digs them all, by one cell north, east, south or west.
+The rules are those of `jaxsand.plan`: a walk over the goal's cells that digs them all, by one cell north, east, south or
+west.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxsand.envs import episode
-from jaxsand.envs.episode import Step
+from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.maps import STEPS, MapGoals, Walks
 from jaxsand.envs.spaces import Box, Dict, Discrete
 
@@ -18,7 +18,20 @@ from jaxsand.envs.spaces import Box, Dict, Discrete
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MapState:
-    """The cells to `dig` and those `dug` [H, W] (bool, row 0 on top), the tool's `place` (row, column), and steps so far."""
+    """The state of an episode on a binary map, row 0 on top.
+
+    Attributes:
+      dig: the cells to dig, booleans [H, W].
+      dug: the cells dug so far, booleans [H, W].
+      place: (row, column) of the tool.
+      time: steps so far.
+
+    Example:
+      >>> env, params = js.make("single-stroke")
+      >>> obs, state = env.reset(jax.random.key(0), params)
+      >>> int(state.dug.sum())
+      1
+    """
 
     dig: jax.Array
     dug: jax.Array
@@ -29,7 +42,17 @@ class MapState:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MapParams:
-    """Where `goals` come from, what a step costs, and after how many steps an episode is truncated."""
+    """The parameters of `OnMap`; `jaxsand.make` makes them.
+
+    Args:
+      goals: what draws a map and its start.
+      step_cost: is taken off the reward of every step.
+      limit: steps after which an episode is truncated.
+
+    Example:
+      >>> js.env.MapParams(limit=20).step_cost
+      0.0
+    """
 
     goals: MapGoals = field(default_factory=Walks)
     step_cost: jax.Array | float = 0.0
@@ -38,24 +61,43 @@ class MapParams:
 
 @dataclass(frozen=True)
 class OnMap:
-    """Actions 0 to 3 are N (one row up in the text), E, S and W, and dig the cell that the tool comes to.
+    """An environment of one stroke over a binary map.
 
-    A step off the goal's cells, or off the map, is not `legal`: it leaves everything as it is, and costs a step. With L the
-    goal's cells that are not dug, the reward is L_t - L_{t+1} - step_cost. An episode ends (terminated) when L is 0; the
-    start is dug when it begins.
+    Actions 0 to 3 move the tool north (one row up in the text), east, south and west, and dig the cell that it comes to. A
+    step off the goal's cells, or off the map, is not legal: it changes nothing, but counts as a step; info["legal"] says so.
 
-    Observations are planes [H, W] of 0 and 1 (float32): "goal", "current" (what is dug) and "pose" (where the tool stands).
+    With L the number of the goal's cells that are not dug, the reward is L_t - L_{t+1} - step_cost. An episode terminates
+    when L is 0, and is truncated after `limit` steps. The start is dug when it begins.
+
+    Observations are planes [H, W] of 0 and 1 (float32), row 0 on top: "goal", "current" (what is dug) and "pose" (where the
+    tool stands).
+
+    Args:
+      shape: of the maps.
+
+    Example:
+      >>> env, params = js.make("single-stroke", on=js.env.OnMap((5, 5)))
+      >>> obs, state = env.reset(jax.random.key(0), params)
+      >>> obs["pose"].shape
+      (5, 5)
     """
 
     shape: tuple[int, int] = (7, 7)
 
     def reset(self, key: jax.Array, params: MapParams) -> tuple[dict[str, jax.Array], MapState]:
+        """Begins an episode; returns its first observation and its state."""
         dig, start = params.goals.draw(key, self.shape)
         state = MapState(dig, _only(self.shape, start), start, jnp.zeros((), jnp.int32))
         return self.observe(state), state
 
-    def step_env(self, key: jax.Array, state: MapState, action: Any, params: MapParams) -> Step:
-        """One step, without a new episode after the last; nothing is drawn from the key."""
+    def step_env(
+        self, key: jax.Array, state: MapState, action: Action, params: MapParams
+    ) -> Step[dict[str, jax.Array], MapState]:
+        """Takes one step, and does not begin a new episode after the last; nothing is drawn from the key.
+
+        Returns:
+          Observation, state, reward, terminated, truncated, info.
+        """
         del key
         legal = self.legal(state, params)[action]
         place = jnp.where(legal, state.place + jnp.asarray(STEPS)[action], state.place)
@@ -69,7 +111,7 @@ class OnMap:
     step = episode.step
 
     def legal(self, state: MapState, params: MapParams) -> jax.Array:
-        """Which of N, E, S, W lead to a cell of the goal [4]."""
+        """Which of north, east, south, west lead to a cell of the goal, [4]."""
         del params
         row, column = (state.place[None] + STEPS).T
         padded = jnp.pad(state.dig, 1)
@@ -80,14 +122,17 @@ class OnMap:
         return jnp.sum(state.dig & ~state.dug)
 
     def observe(self, state: MapState) -> dict[str, jax.Array]:
+        """The observation of a state."""
         planes = {"goal": state.dig, "current": state.dug, "pose": _only(self.shape, state.place)}
         return {name: plane.astype(jnp.float32) for name, plane in planes.items()}
 
     def action_space(self, params: MapParams) -> Discrete:
+        """The space of actions."""
         del params
         return Discrete(4)
 
     def observation_space(self, params: MapParams) -> Dict:
+        """The space of observations."""
         del params
         return Dict({name: Box(0, 1, self.shape) for name in ("goal", "current", "pose")})
 

@@ -1,12 +1,13 @@
-"""Pushes inside an environment, one map or many.
+"""Pushes inside an environment, of one map or of many.
 
-A vmapped push takes as long as the longest of its strokes. `ByLength` therefore tells vmap to sort a batch by the strokes'
-lengths and to push chunk after chunk of like ones, each small enough for a core's cache. A map comes out as it would alone,
-up to rounding. On several cores of a CPU, give each a device of its own and a share of the batch (see the README).
+A vmapped push takes as long as the longest of its strokes. So `ByLength` makes vmap sort a batch by the strokes' lengths,
+and push chunk after chunk of strokes of like length, each chunk small enough for a core's cache. Each map comes out as it
+would alone, up to rounding. On several cores of a CPU, give each a device of its own and a share of the batch.
 
-A rule for vmap has no derivative of its own. What follows is how a push gets one that is batched in the same way: tangents
-and cotangents are sorted and taken chunk after chunk like the maps. The derivative is that of the push alone, in both modes
-and once. Reverse mode keeps nothing of a push but what went into it and pushes each chunk again to pull back through it.
+A rule for vmap has no derivative of its own. Here a push gets one that is batched in the same way: tangents and cotangents
+are sorted and computed chunk by chunk like the maps. The derivative is that of a push alone, in forward and reverse mode,
+and can be taken once. Reverse mode stores only what went into a push, and pushes each chunk again when it goes back through
+it.
 """
 
 from collections.abc import Callable
@@ -35,15 +36,33 @@ Pushing = Callable[[Scene, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 @dataclass(frozen=True)
 class Together:
-    """A batch is pushed all at once, as long as its longest stroke takes (neutral): what suits a GPU."""
+    """Tells `MultiStroke` to push a batch all at once, which takes as long as its longest stroke: suits a GPU.
+
+    Example:
+      >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), batching=js.env.Together())
+      >>> env.batching
+      Together()
+    """
 
     def pushing(self, push: Push, stop: Stop | None) -> Pushing:
+        """The push of one map, to be vmapped as it is."""
         return _alone(push, stop)
 
 
 @dataclass(frozen=True)
 class ByLength:
-    """A batch is pushed in chunks of maps with strokes of like length: what suits a CPU."""
+    """Tells `MultiStroke` to push a batch in chunks of maps with strokes of like length: suits a CPU.
+
+    Args:
+      chunk: maps to a chunk.
+
+    Raises:
+      ValueError: for a chunk below 1.
+
+    Example:
+      >>> js.env.ByLength(chunk=16)
+      ByLength(chunk=16)
+    """
 
     chunk: int = 32
 
@@ -51,6 +70,7 @@ class ByLength:
         check_whole("chunk", self.chunk, 1)
 
     def pushing(self, push: Push, stop: Stop | None) -> Pushing:
+        """The push of one map, which vmap batches by length."""
         return by_length(self, _alone(push, stop))
 
 
@@ -59,6 +79,8 @@ Batching = Together | ByLength
 
 @cache
 def _alone(push: Push, stop: Stop | None) -> Pushing:
+    """The push of one map: the map that it leaves, and the outcome."""
+
     def one(scene: Scene, height: jax.Array, stroke: jax.Array) -> tuple[jax.Array, jax.Array]:
         shaped = step(scene, height, stroke, push=push, stop=stop)
         return shaped.height, shaped.outcome
@@ -68,7 +90,7 @@ def _alone(push: Push, stop: Stop | None) -> Pushing:
 
 @cache
 def by_length(way: ByLength, alone: Pushing) -> Pushing:
-    """A push that vmap batches that way, and so its derivatives; they are those of the push alone."""
+    """A push that vmap batches by length, and so its derivatives."""
 
     def of_floats(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[Callable[..., Any], Any]:
         """The map that is left as a function of all floats, and these."""
@@ -123,7 +145,7 @@ def by_length(way: ByLength, alone: Pushing) -> Pushing:
 
 @cache
 def sorted_by_length(way: ByLength, alone: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of a scene, a map, a stroke and more that vmap batches that way; without derivatives."""
+    """A function of a scene, a map, a stroke and more, which vmap batches by length; it has no derivatives."""
     one = custom_vmap(alone)
 
     @one.def_vmap

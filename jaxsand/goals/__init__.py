@@ -1,1 +1,1 @@
-"""Letters, maps and terrains, where they lie, and how near sand comes to them."""
+"""Goals: letters, maps and terrains, where they lie on the sand, and how near a result comes to them."""

@@ -1,4 +1,4 @@
-"""Goals and surfaces from real input: letters, text maps, images, height maps, terrain. Host side, numpy only."""
+"""Reads goals and surfaces: letters, text maps, images, height maps, terrain. Host side, numpy only."""
 
 import json
 import math
@@ -6,7 +6,6 @@ import string
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,19 +13,19 @@ Cell = tuple[int, int]
 
 
 def letter_strokes(letter: str) -> np.ndarray:
-    """The strokes [n, 4] = x0, y0, x1, y1 of a capital letter in the unit square, y up."""
+    """The strokes [n, 4] = x0, y0, x1, y1 of a capital letter in the unit square, x to the right, y up."""
     table = _stroke_letters()
     if letter not in table:
         raise ValueError(f"letter: got {letter!r}; give one of {string.ascii_uppercase}")
     return np.array(table[letter], float)
 
 
-def stroke_list(field: str, name: object, strokes: Any, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
-    """The strokes [n, 4] of a glyph that a user gave.
+def stroke_list(field: str, name: object, strokes: object, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
+    """Checks the strokes of a glyph that a user gave, and returns them as an array [n, 4].
 
     Raises:
-      ValueError: names the field, the glyph and the stroke, unless there is a stroke or more, of finite numbers from `low`
-        to `high`.
+      ValueError: names the field, the glyph and the stroke, unless there is at least one stroke, all of finite numbers from
+        `low` to `high`.
     """
     try:
         found = np.array(strokes)
@@ -43,7 +42,7 @@ def stroke_list(field: str, name: object, strokes: Any, low: float = -math.inf, 
 
 
 def letter_map(letter: str) -> tuple[np.ndarray, Cell]:
-    """The 7 x 7 binary map of a capital letter (row 0 on top) and the cell where its single stroke starts.
+    """The 7 x 7 binary map of a capital letter (row 0 on top), and the cell (row, column) where its single stroke starts.
 
     A, S, T and R are the maps that best explain the counts published in arXiv:1908.02745.
     """
@@ -55,9 +54,9 @@ def letter_map(letter: str) -> tuple[np.ndarray, Cell]:
 
 
 def read_text_map(text: str, name: str = "map") -> tuple[np.ndarray, Cell | None]:
-    """A map of `#` (dig) and `.`, one row a line, top row first; `S` is a cell to dig where the stroke starts.
+    """Reads a map of `#` (dig) and `.`, one row a line, top row first; `S` marks a cell to dig in which the stroke starts.
 
-    Lines that are empty, and comments, which start with `# `, are no part of it.
+    Empty lines are skipped, and so are comments, which start with `# `.
     """
     lines = [line.rstrip() for line in text.splitlines()]
     lines = [line for line in lines if line.strip() and not line.startswith("# ")]
@@ -82,7 +81,7 @@ def read_text_map(text: str, name: str = "map") -> tuple[np.ndarray, Cell | None
 
 
 def read_image(path: str | Path) -> np.ndarray:
-    """A picture as a map of 0 (white) to -1 (black), row 0 at the bottom; transparency counts as white."""
+    """Reads a picture as a map from 0 (white) to -1 (black), row 0 at the bottom; transparency counts as white."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -98,7 +97,7 @@ def read_image(path: str | Path) -> np.ndarray:
 
 
 def read_heights(path: str | Path) -> np.ndarray:
-    """A height map [H, W] (m) from a .npy file; its row 0 is at y = 0, where a picture's is on top."""
+    """Reads a height map [H, W] (m) from a .npy file; its row 0 is at y = 0, where a picture's row 0 is on top."""
     try:
         with Path(path).open("rb") as file:
             if file.read(6) != b"\x93NUMPY":
@@ -120,7 +119,7 @@ def read_heights(path: str | Path) -> np.ndarray:
 def text_strokes(text: str) -> np.ndarray:
     """The strokes [n, 4] of any text, y up, in Hershey's single-stroke Roman font.
 
-    One sign fills the unit square; a longer text is 1 high and starts at x = 0.
+    A single character fills the unit square; a longer text is 1 high and starts at x = 0.
 
     Needs the extra `letters`: pip install 'jaxsand[letters]'.
     """

@@ -1,7 +1,7 @@
-"""What a result is measured by, and goals as height maps.
+"""Measures of how near a map is to its goal, and goals as height maps.
 
-Lengths in metres. A cell counts as dug when it is lower than half the trench depth. A goal drawn as a binary map holds no
-berms, so it is compared on min(h, 0), on what is dug, as arXiv:1908.02745 does; the figure with berms is given beside it.
+Lengths are in metres. A cell counts as dug when it is lower than half the trench depth. A goal drawn as a binary map holds
+no berms, so it is compared on min(h, 0), on what is dug, as arXiv:1908.02745 does; the figure with berms is given beside it.
 """
 
 import math
@@ -12,56 +12,164 @@ import numpy as np
 
 from jaxsand.scene.scene import Scene
 
+_Map = jax.Array | np.ndarray
+"""Heights [..., H, W] (m)."""
+
 GLYPH_SQUARE = (0.035, 0.285)
 """Where a glyph's unit square lies on the 32 x 32 map of 0.01 m cells, in x and y (m)."""
 
 
 def dug(height: jax.typing.ArrayLike, depth: jax.typing.ArrayLike) -> jax.Array:
-    """Which cells are dug: h < -depth / 2."""
+    """Which cells are dug: h < -depth / 2.
+
+    Args:
+      height: [..., H, W] (m), level sand at 0.
+      depth: of a trench (m).
+
+    Returns:
+      Booleans [..., H, W].
+
+    Example:
+      >>> js.task.dug(jnp.array([0.0, -0.004]), depth=0.006).tolist()
+      [False, True]
+    """
     return jnp.asarray(height) < -jnp.asarray(depth) / 2
 
 
 def iou(goal: jax.typing.ArrayLike, height: jax.typing.ArrayLike, depth: jax.typing.ArrayLike) -> jax.Array:
-    """Intersection over union of the dug cells of two maps, over the last two axes; 1 where neither has any."""
+    """The intersection over union of the dug cells of two maps.
+
+    Args:
+      goal: [..., H, W] (m), level sand at 0.
+      height: [..., H, W] (m).
+      depth: of a trench (m); see `dug`.
+
+    Returns:
+      [...], 0 to 1; 1 where neither map has a dug cell.
+
+    Example:
+      >>> goal, height = jnp.array([[0.0, -0.006]]), jnp.array([[-0.006, -0.006]])
+      >>> float(js.task.iou(goal, height, depth=0.006))
+      0.5
+    """
     a, b = dug(goal, depth), dug(height, depth)
     both = jnp.sum(a & b, axis=(-2, -1))
     either = jnp.sum(a | b, axis=(-2, -1))
     return jnp.where(either == 0, 1.0, both / jnp.maximum(either, 1))
 
 
-def l2(goal: jax.Array, height: jax.Array) -> jax.Array:
-    """The l2 distance of two maps, sqrt(sum (goal - h)^2) (m), over the last two axes. Differentiable where it is not 0."""
+def l2(goal: _Map, height: _Map) -> jax.Array:
+    """The l2 distance of two maps, sqrt(sum (goal - h)^2).
+
+    Args:
+      goal: [..., H, W] (m).
+      height: [..., H, W] (m).
+
+    Returns:
+      [...] (m). Differentiable where it is not 0.
+
+    Example:
+      >>> float(js.task.l2(jnp.zeros((2, 2)), jnp.ones((2, 2))))
+      2.0
+    """
     square = jnp.sum((goal - height) ** 2, axis=(-2, -1))
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
-def l2_reduction(goal: jax.Array, before: jax.Array, after: jax.Array) -> jax.Array:
-    """1 - l2 after / l2 before: 1 at the goal, 0 where nothing was gained, below 0 where it got worse."""
+def l2_reduction(goal: _Map, before: _Map, after: _Map) -> jax.Array:
+    """The share of the distance to the goal that is gone, 1 - l2 after / l2 before.
+
+    Args:
+      goal: [..., H, W] (m).
+      before: [..., H, W] (m).
+      after: [..., H, W] (m).
+
+    Returns:
+      [...]: 1 at the goal, 0 where nothing was gained, below 0 where it got worse.
+
+    Source: arXiv:1908.02745.
+
+    Example:
+      >>> goal = jnp.full((2, 2), -1.0)
+      >>> float(js.task.l2_reduction(goal, jnp.zeros((2, 2)), goal / 2))
+      0.5
+    """
     start, end = l2(goal, before), l2(goal, after)
     return jnp.where(start > 0, 1 - end / jnp.where(start > 0, start, 1), jnp.where(end > 0, -jnp.inf, 1.0))
 
 
-def below(height: jax.Array) -> jax.Array:
-    """Only what is dug: min(h, 0)."""
+def below(height: _Map) -> jax.Array:
+    """What is dug of a map, min(h, 0).
+
+    Args:
+      height: [...] (m), level sand at 0.
+
+    Returns:
+      [...] (m).
+
+    Example:
+      >>> js.task.below(jnp.array([2.0, -1.0])).tolist()
+      [0.0, -1.0]
+    """
     return jnp.minimum(height, 0)
 
 
 def volume_error(before: jax.typing.ArrayLike, after: jax.typing.ArrayLike) -> float:
-    """|V1 - V0| / (dx^2 max(sum |h0|, sum |h1 - h0|)), and 0 when both sums are 0; in float64 on the host."""
+    """How much sand was lost or won, as a share of what moved: |V1 - V0| / (dx^2 max(sum |h0|, sum |h1 - h0|)).
+
+    Args:
+      before: h0 [H, W] (m).
+      after: h1 [H, W] (m).
+
+    Returns:
+      A number, 0 when both sums are 0. Computed in float64 on the host.
+
+    Example:
+      >>> js.task.volume_error([[0.0, 0.0]], [[0.5, -0.25]])
+      0.3333333333333333
+    """
     h0, h1 = np.asarray(before, np.float64), np.asarray(after, np.float64)
     moved = max(math.fsum(np.abs(h0).ravel()), math.fsum(np.abs(h1 - h0).ravel()))
     return abs(math.fsum([*h1.ravel(), *-h0.ravel()])) / moved if moved else 0.0
 
 
 def map_goal(dig: np.ndarray, cell: int, margin: int, depth: float) -> np.ndarray:
-    """A binary map in text order (row 0 on top) as a height map: each cell `cell` grid cells wide, -depth where it is to be
-    dug and 0 elsewhere, with `margin` grid cells of level sand around."""
+    """A binary map as a height map: -depth in the cells to dig, 0 elsewhere.
+
+    Args:
+      dig: booleans [rows, columns], in text order (row 0 on top).
+      cell: grid cells to a side of a map cell.
+      margin: grid cells of level sand around the map.
+      depth: of the trench (m).
+
+    Returns:
+      [rows cell + 2 margin, columns cell + 2 margin] (m), row 0 at y = 0.
+
+    Example:
+      >>> js.task.map_goal(np.array([[True], [False]]), cell=1, margin=0, depth=0.01).tolist()
+      [[-0.0], [-0.01]]
+    """
     block = np.kron(np.flipud(dig).astype(float), np.ones((cell, cell)))
     return np.pad(-depth * block, margin)
 
 
 def cell_centre(cells: np.ndarray, rows: int, cell: int, margin: int, spacing: float) -> np.ndarray:
-    """Where the centres of map cells (row, column; row 0 on top) lie: [n, 2] of x, y (m); see `map_goal`."""
+    """Where the centres of map cells lie on the sand of `map_goal`.
+
+    Args:
+      cells: [n, 2] (row, column), row 0 on top.
+      rows: of the map.
+      cell: grid cells to a side of a map cell.
+      margin: grid cells of level sand around the map.
+      spacing: of the grid (m).
+
+    Returns:
+      [n, 2] of x, y (m).
+
+    Example:
+      >>> js.task.cell_centre(np.array([[1, 0]]), rows=2, cell=1, margin=0, spacing=0.01).tolist()
+      [[0.005, 0.005]]
+    """
     cells = np.asarray(cells, float)
     x = (margin + (cells[:, 1] + 0.5) * cell) * spacing
     y = (margin + (rows - cells[:, 0] - 0.5) * cell) * spacing
@@ -69,20 +177,47 @@ def cell_centre(cells: np.ndarray, rows: int, cell: int, margin: int, spacing: f
 
 
 def place(strokes: np.ndarray, square: tuple[float, float] = GLYPH_SQUARE) -> np.ndarray:
-    """Strokes [n, 4] of the unit square in the square [low, high] of the map (m)."""
+    """Strokes of the unit square in a square of the map.
+
+    Args:
+      strokes: [n, 4] = x0, y0, x1, y1, each 0 to 1, y up.
+      square: its lowest and highest x and y (m).
+
+    Returns:
+      [n, 4] (m).
+
+    Example:
+      >>> js.task.place(np.array([[0.0, 0.0, 1.0, 0.5]]), square=(1.0, 3.0)).tolist()
+      [[1.0, 1.0, 3.0, 2.0]]
+    """
     low, high = square
     return low + np.asarray(strokes, float) * (high - low)
 
 
 def resample(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """A map of another shape over the same field: the mean over each new cell where cells grow larger, bilinear where they
-    grow smaller. Rows and columns are scaled apart."""
+    """A map at another resolution over the same field.
+
+    Where cells grow larger, each new cell has the mean over its area; where they grow smaller, heights are interpolated
+    linearly. Rows and columns are scaled independently.
+
+    Args:
+      image: [H, W].
+      shape: of the new map.
+
+    Returns:
+      The new map, of `shape`.
+
+    Example:
+      >>> js.task.resample(np.array([[0.0, 2.0], [4.0, 6.0]]), (1, 1)).tolist()
+      [[3.0]]
+    """
     for axis in (0, 1):
         image = np.moveaxis(_resample_rows(np.moveaxis(image, axis, 0), shape[axis]), 0, axis)
     return image
 
 
 def _resample_rows(image: np.ndarray, rows: int) -> np.ndarray:
+    """A map with another number of rows, by means or by linear interpolation."""
     old = image.shape[0]
     if rows == old:
         return image
@@ -100,7 +235,22 @@ def _resample_rows(image: np.ndarray, rows: int) -> np.ndarray:
 
 
 def fits(scene: Scene, goal: np.ndarray, name: str = "goal") -> None:
-    """Raises ValueError unless a goal, or what goes by that name, has the scene's shape and is finite."""
+    """Checks that a goal has the scene's shape and is finite.
+
+    Args:
+      scene: the scene.
+      goal: [H, W] (m).
+      name: of the goal, for the message.
+
+    Returns:
+      None.
+
+    Raises:
+      ValueError: if it has another shape, or a cell that is not finite.
+
+    Example:
+      >>> js.task.fits(js.make_scene((4, 4), 0.01), np.zeros((4, 4)))
+    """
     if goal.shape != scene.grid.shape:
         raise ValueError(
             f"{name}: got shape {list(goal.shape)}, the scene has {list(scene.grid.shape)}; "
@@ -110,6 +260,23 @@ def fits(scene: Scene, goal: np.ndarray, name: str = "goal") -> None:
 
 
 def finite(goal: np.ndarray, name: str = "goal") -> None:
-    """Raises ValueError unless every cell is finite."""
+    """Checks that every cell of a goal is finite.
+
+    Args:
+      goal: [H, W] (m).
+      name: of the goal, for the message.
+
+    Returns:
+      None.
+
+    Raises:
+      ValueError: if a cell is not finite; it says how many.
+
+    Example:
+      >>> js.task.finite(np.array([[np.nan]]))
+      Traceback (most recent call last):
+        ...
+      ValueError: goal: got 1 cells that are not finite; fill them first
+    """
     if not np.all(np.isfinite(goal)):
         raise ValueError(f"{name}: got {int(np.sum(~np.isfinite(goal)))} cells that are not finite; fill them first")

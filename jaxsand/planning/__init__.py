@@ -1,1 +1,1 @@
-"""From a goal to strokes."""
+"""Planning: from a goal to the strokes that make it."""

@@ -1,4 +1,4 @@
-"""Strokes for a goal by what tries them on the sand: a search, gradients, or the policy that comes with jaxsand."""
+"""Plans strokes for a goal by trying them on simulated sand: by search, by gradients, or by the shipped policy."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -15,9 +15,10 @@ from jaxsand.scene.progress import Tell
 
 
 def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: int, seed: int, tell: Tell) -> Target:
-    """The same goal, by at most so many strokes from a search on real sand, at a cost of about `pushes` (see `plan_sand`).
+    """The target with at most `strokes` strokes from a search on real sand, which costs about `pushes` pushes (see
+    `plan_sand`).
 
-    Sand counts wherever it lies, also where the goal was drawn without berms.
+    The distance counts all sand, berms too, even where the goal was drawn without berms.
     """
     start = at_rest(target.scene, before, tell)
     tell(f"searching {strokes} strokes in about {pushes} pushes")
@@ -26,7 +27,7 @@ def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: in
 
 
 def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:
-    """The same goal, by so many strokes (as many as pay if None) from gradients, at a cost of about `pushes`."""
+    """The target with `strokes` strokes (None: as many as pay) from gradients, which cost about `pushes` pushes."""
     start = at_rest(target.scene, before, tell)
     tell("sketching")
     found = optimise_strokes(target.scene, target.goal, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)
@@ -34,12 +35,12 @@ def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pu
 
 
 def by_policy(target: Target, before: np.ndarray | None, strokes: int, stages: Stages, tell: Tell) -> Target:
-    """The same goal, by at most so many strokes of the policy, and of the stages that follow it."""
+    """The target with at most `strokes` strokes of the policy, improved by the stages that follow it."""
     sand = SandLoss(target.scene, at_rest(target.scene, before, tell), target.goal.astype(np.float32))
     found = plan_by_policy(load_policy(), sand, strokes, stages, tell)
     return _by("policy", target, found, found.strokes.reshape(-1, 2, 2))
 
 
 def _by(method: str, target: Target, found: SandPlan | Optimised | Planned, paths: Iterable[np.ndarray]) -> Target:
-    """The same goal by what was found."""
+    """The target with the paths that a method found."""
     return replace(target, method=method, paths=tuple(paths), optimal=None, lower_bound=None, found=found)

@@ -1,4 +1,4 @@
-"""The main job: from a goal to the strokes that trench it, to the sand they leave, to what that is worth."""
+"""From a goal to strokes, from strokes to the sand that they leave, and figures of how near that comes to the goal."""
 
 import math
 import time
@@ -31,10 +31,17 @@ Kind = Literal["map", "glyph", "image", "heights", "terrain"]
 
 @dataclass(frozen=True)
 class Layout:
-    """How a binary map is laid out in sand: `cell` grid cells to a map cell, `spacing` and `depth` in m.
+    """How a binary map is laid out on sand, for the single stroke.
 
-    A pushed trench is narrower than the blade, since its berms slide back over the edges: at half depth by about
-    sqrt(depth width / tan(repose)). So trenches are shallow against a cell, and the blade is a little larger than one.
+    A pushed trench is narrower than the blade, since its berms slide back over the edges: at half depth by about sqrt(depth
+    width / tan(repose angle)). So trenches are shallow against a cell, and the blade is a little larger than a cell.
+
+    Args:
+      cell: grid cells to a side of a map cell.
+      spacing: of the grid (m).
+      depth: of the trench (m).
+      oversize: the blade's side over the map cell's side.
+      margin: grid cells of level sand around the map.
     """
 
     cell: int = 6
@@ -45,16 +52,27 @@ class Layout:
 
     @property
     def blade(self) -> Blade:
+        """The square blade that digs one map cell at a time."""
         side = self.oversize * self.cell * self.spacing
         return Blade(side, side, self.depth)
 
 
 @dataclass(frozen=True)
 class Target:
-    """A goal with the strokes that are to reach it.
+    """A goal, and the strokes that are to make it.
 
-    `paths` are followed one after the other, the tool lifted in between. `drawn` goals hold no berms and are compared on
-    what is dug.
+    Attributes:
+      name: of the goal, for titles and files.
+      kind: what the goal was given as.
+      method: what planned the strokes.
+      scene: grid, sand and tool.
+      goal: [H, W] (m), row 0 at y = 0.
+      paths: points [n, 2] = x, y (m) of each path; the tool is lifted between paths.
+      drawn: whether the goal was drawn without berms, so that only min(h, 0) is compared.
+      depth: of a trench (m).
+      optimal: whether the number of steps is proven to be the fewest; None where nothing was proven.
+      lower_bound: no plan has fewer steps; None where nothing was proven.
+      found: what a method that tries strokes on sand reported.
     """
 
     name: str
@@ -78,7 +96,17 @@ class Target:
 
 @dataclass(frozen=True)
 class ShapeResult:
-    """What came out: the map before and after, frames on the way, the figures, and seconds apart for compile and run."""
+    """What pushing a target's strokes made of the sand.
+
+    Attributes:
+      target: the goal and the strokes.
+      before: the map [H, W] (m) before, at rest.
+      after: the map [H, W] (m) after all strokes.
+      frames: maps [F, H, W] (m) on the way, for an animation.
+      tools: [F, 4] x, y (m), cos and sin of the tool's heading in each frame; NaN while it is lifted.
+      figures: iou, l2_reduction, l2_reduction_with_berms, volume_error and max_slope_deg.
+      seconds: run times of `prepare`, `compile` and `run`.
+    """
 
     target: Target
     before: np.ndarray
@@ -90,11 +118,12 @@ class ShapeResult:
 
     @property
     def lifted(self) -> bool:
+        """Whether the tool is lifted between paths."""
         return len(self.target.paths) > 1
 
     @property
     def steps(self) -> int:
-        """Legs of some length."""
+        """The number of legs that have a length above 0."""
         return sum(int(np.any(np.diff(path, axis=0), axis=1).sum()) for path in self.target.paths)
 
     @property
@@ -104,7 +133,7 @@ class ShapeResult:
 
 
 def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -> Target:
-    """A shortest single stroke over a binary map (row 0 on top), pushed with a blade of about one map cell."""
+    """The shortest single stroke over a binary map (row 0 on top), with a blade about as wide as a map cell."""
     found = plan(dig, start)
     rows, columns = dig.shape
     shape = (rows * layout.cell + 2 * layout.margin, columns * layout.cell + 2 * layout.margin)
@@ -116,9 +145,13 @@ def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -
 
 
 def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
-    """A shortest single stroke over each piece of a height map that lies deeper than half the depth.
+    """The shortest single stroke over each connected piece of a height map [H, W] (m) that is deeper than half the trench
+    depth.
 
-    The map is planned on blocks of `layout.cell` grid cells, of which those are dug whose mean lies deep enough.
+    The map is divided into blocks of `layout.cell` grid cells a side, and a block is dug where its mean is deep enough.
+
+    Raises:
+      ValueError: for a goal that is not finite, smaller than a block, or nowhere deep enough.
     """
     goal = np.asarray(goal, float)
     task.finite(goal)
@@ -150,9 +183,9 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
 
 
 def glyph_target(strokes: np.ndarray, name: str) -> Target:
-    """A glyph's own strokes, pushed one by one; the goal is what they leave on level sand.
+    """A glyph's own strokes [n, 4] of the unit square, pushed one by one; the goal is what they leave on level sand.
 
-    A glyph of the unit square takes 32 x 32 cells of 0.01 m; a wider text as many more columns as it needs.
+    A glyph takes 32 x 32 cells of 0.01 m, and a wider text as many more columns as it needs.
     """
     blade, spacing = Blade(), 0.01
     placed = task.place(strokes)
@@ -168,7 +201,9 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
 
 
 def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> Target:
-    """A picture (0 to -1, row 0 at the bottom) as a height map of at most `cells` grid cells a side, plus the margin."""
+    """A picture (0 to -1, row 0 at the bottom) as a height map of at most `cells` grid cells a side, and the margin around
+    it.
+    """
     scale = cells / max(picture.shape)
     shape = [max(1, round(n * scale)) for n in picture.shape]
     goal = np.pad(layout.depth * task.resample(picture, (shape[0], shape[1])), layout.margin)
@@ -176,10 +211,15 @@ def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> 
 
 
 def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) -> ShapeResult:
-    """Pushes a target's strokes on `before` [H, W] (m; level sand at 0 if None), which is settled first.
+    """Pushes a target's strokes and measures the result.
+
+    Args:
+      target: the goal and the strokes.
+      before: the surface [H, W] (m), which is settled first; None stands for level sand at 0.
+      tell: is called with a line of progress.
 
     Raises:
-      OutcomeError: if the sand does not come to rest or something is not finite.
+      OutcomeError: if the sand does not come to rest, or something is not finite.
     """
     scene = target.scene
     began = time.perf_counter()
@@ -212,7 +252,7 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) 
 
 
 def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
-    """A surface [H, W] (m; level sand at 0 if None) once it has settled."""
+    """A surface [H, W] (m) after it has settled; level sand at 0 for None."""
     if before is None:
         return np.zeros(scene.grid.shape, np.float32)
     task.fits(scene, before)
@@ -223,7 +263,9 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
 
 
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:
-    def reduction(view: Callable[..., Any]) -> float:
+    """The figures of a result by name; see `ShapeResult`."""
+
+    def reduction(view: Callable[[np.ndarray], np.ndarray]) -> float:
         return float(task.l2_reduction(view(target.goal), view(before.astype(float)), view(after.astype(float))))
 
     whole = reduction(lambda h: h)
@@ -238,9 +280,9 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
 
 @cache
 def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]], float]:
-    """`follow_frames` for paths of a given number of points, compiled ahead, and the seconds that took.
+    """`follow_frames` for paths of `points` points, compiled ahead, and the seconds that compiling took.
 
-    On the whole map: the heap of a path of many legs outgrows any window that the blade's size tells.
+    It works on the whole map: the heap of a path of many legs outgrows any window that fits the blade.
     """
     began = time.perf_counter()
     scene = replace(scene, window=Whole())
@@ -251,12 +293,12 @@ def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array]
 
 
 def _padded(path: np.ndarray, points: int) -> np.ndarray:
-    """The path with its last point repeated; a leg of no length does nothing."""
+    """The path with its last point repeated up to `points` points; a leg without length changes nothing."""
     return np.concatenate([path, np.repeat(path[-1:], points - len(path), axis=0)])
 
 
 def _moments(scene: Scene, height: np.ndarray, path: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Maps on the way along a path, and the tool's pose in each: after every leg, or along a single stroke."""
+    """Maps on the way along a path, and the tool's pose in each: after every leg, or at six places of a single stroke."""
     if len(path) > 2:
         runs = np.diff(path, axis=0)
         return legs[: len(runs)], np.concatenate([path[1:], _headings(runs)], 1)

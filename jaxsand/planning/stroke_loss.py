@@ -1,6 +1,6 @@
-"""How far plans of strokes end from a goal: many at once, through the simulator, and counted.
+"""How far plans of strokes end from a goal, for many plans at once.
 
-They are pushed by batched.py.
+A plan is an array [N, 4] of strokes x0, y0, x1, y1 (m). Every stroke that is pushed counts as one call of the simulator.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,13 @@ Weigh = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True)
 class Best:
-    """The best plan [N, 4] (m) after so many calls, and its loss (m^2)."""
+    """The best plan so far.
+
+    Attributes:
+      calls: how many calls of the simulator it took to find it.
+      loss: squared distance (m^2) from the goal.
+      strokes: [N, 4] (m).
+    """
 
     calls: int
     loss: float
@@ -32,7 +38,7 @@ class Best:
 
 
 class Evaluate(Protocol):
-    """What a search may ask. Every stroke of every candidate is one call."""
+    """What a search may ask of the sand; every stroke of every candidate counts as one call."""
 
     @property
     def start(self) -> np.ndarray:
@@ -47,9 +53,12 @@ class Evaluate(Protocol):
 
 @dataclass(frozen=True)
 class SandLoss:
-    """The squared l2 distance (m^2) from `goal` [H, W] (m) of what strokes leave of `start` [H, W] (m), which is at rest.
+    """The squared l2 distance (m^2) between the goal and what a plan leaves; infinite where an outcome is not clean.
 
-    Infinite where the simulator says that its outcome is not clean.
+    Args:
+      scene: grid, sand and blade.
+      start: the map [H, W] (m) before the first stroke, at rest.
+      goal: [H, W] (m).
     """
 
     scene: Scene
@@ -61,9 +70,11 @@ class SandLoss:
         fits(self.scene, self.goal)
 
     def __call__(self, candidates: np.ndarray) -> np.ndarray:
+        """The losses [P] of plans [P, N, 4] (m)."""
         return self._loss(self.maps(candidates))
 
     def after(self, maps: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The losses [P] and the maps [P, H, W] after one more stroke [P, 4] (m) on each of `maps` [P, H, W]."""
         maps = pushed(self.scene, maps, strokes)
         return self._loss(maps), maps
 
@@ -75,9 +86,16 @@ class SandLoss:
         return maps
 
     def gradient(self, candidates: np.ndarray, weigh: Weigh) -> tuple[np.ndarray, np.ndarray]:
-        """`weigh(maps - goal)` [P] of plans [P, N, 4] and its gradient by them; infinite, or NaN, where not clean.
+        """The values and the gradients of a loss of plans.
 
-        `weigh` also gives its own gradient by the difference. Backwards, stroke by stroke, as the maps on the way are kept.
+        The gradient is taken backwards stroke by stroke, from maps that are kept on the way.
+
+        Args:
+          candidates: plans [P, N, 4] (m).
+          weigh: from the differences maps - goal [P, H, W] to the loss [P] and its gradient by them [P, H, W].
+
+        Returns:
+          The loss [P], infinite where an outcome is not clean, and its gradient [P, N, 4] by the plans, NaN there.
         """
         maps = [np.repeat(self.start[None].astype(np.float32), len(candidates), axis=0)]
         for k in range(candidates.shape[1]):
@@ -90,7 +108,7 @@ class SandLoss:
 
     @property
     def bounds(self) -> np.ndarray:
-        """The lowest and the highest x0, y0, x1, y1 (m) of strokes from cell centre to cell centre of the map: [2, 4]."""
+        """The lowest and the highest x0, y0, x1, y1 (m) that a stroke may have: [2, 4]."""
         rows, columns = self.scene.grid.shape
         high = np.array([columns - 1, rows - 1, columns - 1, rows - 1]) * float(self.scene.grid.spacing)
         return np.stack([np.zeros(4), high])
@@ -105,7 +123,9 @@ class SandLoss:
 
 
 def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
-    """What one stroke [P, 4] (m) each leaves of maps [P, H, W] (m) at rest; NaN where the outcome is not clean."""
+    """The maps [P, H, W] (m) after one stroke [P, 4] (m) on each of the maps [P, H, W] (m); NaN where an outcome is not
+    clean.
+    """
     maps = np.asarray(maps, np.float32)
     if not len(maps):
         return maps
@@ -114,7 +134,7 @@ def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
 
 
 def _pulled(scene: Scene, maps: np.ndarray, strokes: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The cotangents of maps [P, H, W] and strokes [P, 4] from those of what the strokes leave."""
+    """The cotangents of maps [P, H, W] and strokes [P, 4], from the cotangents of the maps that the strokes leave."""
     maps, strokes, back = (np.asarray(x, np.float32) for x in (maps, strokes, np.nan_to_num(back)))
     _, (of_maps, of_strokes) = value_and_grad_batch(scene, jnp.vdot, maps, strokes, back)
     return np.asarray(of_maps), np.asarray(of_strokes)

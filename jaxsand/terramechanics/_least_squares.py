@@ -1,18 +1,18 @@
-"""Least squares with error bars: the climb, and what is to be said of where it ends.
+"""Least squares with error bars: minimise the squared misfit from several starts, then judge the best result.
 
-The cost sum r(x)^2 of residuals r (m) is brought down by Gauss-Newton steps (J^T J + damping D) dx = -J^T r, D the diagonal
-of J^T J (Levenberg 1944, Marquardt 1963, doi:10.1137/0111030). Parameters are measured in their ranges, x from 0 to 1, and
-stay there. An error bar has two parts. The noise's covariance is sigma^2 (J^T J)^-1, that of white noise sigma to first
-order, which is also the Cramer-Rao bound. The grid's is d d^T + e e^T, with d the way from the fit to where it would end on
-an ever finer grid, and e what may be wrong of d (_limit.py): the same in every repetition of an experiment, and in one
-proportion for all parameters.
+The cost sum r(x)^2 of residuals r (m) is minimised by Gauss-Newton steps (J^T J + damping D) dx = -J^T r, D the diagonal of
+J^T J (Levenberg 1944, Marquardt 1963, doi:10.1137/0111030). Every parameter is scaled by its range, so that x runs from 0 to
+1, and x is kept in there. An error bar has two parts. The noise's covariance is sigma^2 (J^T J)^-1, which for white noise of
+standard deviation sigma holds to first order and is also the Cramer-Rao bound. The grid's covariance is d d^T + e e^T, where
+d is the distance from the fit to the fit on an infinitely fine grid, and e the uncertainty of d (_limit.py): this error is
+the same in every repetition of an experiment, and acts on all parameters together.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from jax import lax
 from jaxsand.terramechanics._limit import Reference, seek_limit
 
 Model = TypeVar("Model")
+Free = Sequence[str] | Mapping[str, tuple[float, float]]
+"""The names of the free parameters, or their ranges (low, high) by name."""
+
 _LOOKS = 40
 _NEAR = 1e-4  # of sigma^2: what a step that is not worth taking promises, 0.01 standard errors
 _FINE = 1e-5  # of a range: a step that is none
@@ -30,40 +33,73 @@ _IDLE = 12.0  # 1 / variance of a parameter of which no more is known than its r
 
 
 class Verdict(IntFlag):
-    """What a calibration has to say for itself; 0 is a clean one."""
+    """What a calibration says about its own result: flags that may be combined, 0 when nothing is wrong.
+
+    Attributes:
+      NOT_CONVERGED: the best start was still moving after the last step.
+      NOT_TOLD: the data do not determine some parameter, or some mixture of several; `Calibration.untold` names them.
+      AT_LIMIT: an estimate lies at an end of its range: widen the range, or doubt the model.
+      AMBIGUOUS: another start fits as well, within two standard deviations, at a place more than five standard errors away.
+      POOR_FIT: the residual is larger than the given noise explains, by five standard deviations: doubt the model, or the
+        noise.
+      UNCLEAN: the simulator's outcome is not clean at the estimate (see `jaxsand.check`), or a section's model has no
+        profile next to it.
+      FEW_DATA: the noise was estimated from fewer than 20 numbers more than are free, so that the errors may be far off:
+        give `noise`.
+      GRID_UNKNOWN: the grid's part of the errors was not asked for or could not be found: `grid_errors` and `sand` are NaN,
+        and `errors` hold the noise's part alone.
+
+    Example:
+      >>> verdict = js.Verdict.AT_LIMIT | js.Verdict.POOR_FIT
+      >>> js.Verdict.AT_LIMIT in verdict
+      True
+      >>> bool(js.Verdict(0))
+      False
+    """
 
     NOT_CONVERGED = 1
-    """The best start was still moving after the last step."""
     NOT_TOLD = 2
-    """The data tell some parameter, or some mixture of several, no better than its range does: see `untold`."""
     AT_LIMIT = 4
-    """An estimate lies at an end of its range: widen the range, or doubt the model."""
     AMBIGUOUS = 8
-    """Another start fits as well, within two standard deviations, more than five standard errors away."""
     POOR_FIT = 16
-    """The residual is larger than the given noise explains, by five standard deviations: doubt the model, or the noise."""
     UNCLEAN = 32
-    """The simulator's outcome is not clean at the estimate (see `jaxsand.check`), or a section's model ends next to it."""
     FEW_DATA = 64
-    """The noise was estimated from fewer than 20 numbers more than are free: the errors may be far off; give `noise`."""
     GRID_UNKNOWN = 128
-    """The grid's part of the errors was not asked for, or could not be found (the reference was not clean, or left the
-    ranges): `grid_errors` and `sand` are NaN, and `errors` hold the noise's part alone."""
 
 
 @dataclass(frozen=True)
 class Calibration(Generic[Model]):
-    """What was found: `values` and standard `errors` by name, in SI units and rad, and their `covariance` in that order.
+    """The parameters that a calibration found, with error bars and a verdict; `calibrate` and `calibrate_sections` return
+    it.
 
-    The values are the model's, on its own grid: with them it best explains the data. The errors say how far the sand's own
-    may be from them, errors^2 = noise_errors^2 + grid_errors^2. `sand` has the values without the grid's error, found from
-    two grids of a model that converges, and `sand_errors` how well they are known: the noise's part, and half of what was
-    extrapolated.
+    Lengths are in metres, angles in radians. The values belong to the model on its own grid: with them it explains the
+    data best. The errors say how far the values may be from those of the real sand, errors^2 = noise_errors^2 +
+    grid_errors^2.
 
-    `untold` parameters have infinite errors. `residual` is the rms misfit (m), `noise` the sigma (m) on which the errors
-    rest, `calls` how often the model was run, `model` the model with the values put in. `noise_covariance` is the noise's
-    part of the covariance. Where the grid's part is unknown, `grid_errors`, `sand` and `sand_errors` are NaN, the others
-    hold the noise's part alone, and the verdict says GRID_UNKNOWN.
+    Attributes:
+      values: estimates by parameter name.
+      errors: standard errors of `values` by name; infinite for parameters in `untold`. Where the grid's part is unknown
+        they hold the noise's part alone.
+      noise_errors: the part of `errors` that white noise in the data causes.
+      grid_errors: the part of `errors` that the model's grid causes; NaN where unknown.
+      sand: the estimates without the grid's error, extrapolated from two grids; NaN where unknown.
+      sand_errors: standard errors of `sand`: the noise's part, and half of what was extrapolated; NaN where unknown.
+      covariance: [P, P] covariance of the values, parameters in the order of `values`.
+      noise_covariance: [P, P] the noise's part of `covariance`.
+      untold: names of the parameters that the data do not determine.
+      residual: root mean square misfit (m).
+      noise: the standard deviation (m) of the data's noise on which the errors rest, given or estimated.
+      calls: how many times the model was run.
+      verdict: what is wrong with the result; `Verdict(0)` if nothing.
+      model: the model with the values put in: a `Scene`, or a tuple of wheel passes.
+
+    Example:
+      >>> run = js.trench.Pass(slip_angle=math.radians(45), sinkage=0.015)
+      >>> x = np.linspace(-0.1, 0.1, 101)
+      >>> section = js.Section(run, x, js.trench.closed_form(run)(x))
+      >>> found = js.calibrate_sections(section, free=["sinkage"], starts=1, noise=1e-4, model=js.trench.closed_form)
+      >>> round(found.values["sinkage"], 6), found.converged, found.untold
+      (0.015, True, ())
     """
 
     values: dict[str, float]
@@ -83,12 +119,13 @@ class Calibration(Generic[Model]):
 
     @property
     def converged(self) -> bool:
+        """Whether the best start had come to rest."""
         return Verdict.NOT_CONVERGED not in self.verdict
 
 
 @dataclass(frozen=True)
 class Range:
-    """A free parameter: its name, the ends of its range, and the guess from which the first start sets out."""
+    """A free parameter: its name, the ends of its range, and the guess at which the first start begins."""
 
     name: str
     low: float
@@ -100,9 +137,11 @@ class Range:
             raise ValueError(f"free: got {self.low!r} to {self.high!r} for {self.name}; give a finite (low, high)")
 
 
-def as_ranges(free: Any) -> dict[str, tuple[float, float] | None]:
-    """The names that are free, each with its range if one is given."""
-    ranges = dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
+def as_ranges(free: Free) -> dict[str, tuple[float, float] | None]:
+    """Maps each free name to its range, or to None where the user gave none."""
+    ranges: dict[str, tuple[float, float] | None] = (
+        dict(free) if isinstance(free, Mapping) else dict.fromkeys([free] if isinstance(free, str) else free)
+    )
     if not ranges:
         raise ValueError("free: got no names; free at least one parameter")
     for name, ends in ranges.items():
@@ -118,7 +157,7 @@ def check_noise(noise: float | None) -> None:
 
 
 def spread(ranges: list[Range], starts: int) -> np.ndarray:
-    """Starts [starts, P] in units of the ranges: the guess, and points that fill the middle three quarters evenly.
+    """The starting points [starts, P] in units of the ranges: the guess, then points spread evenly over the middle 3/4.
 
     Source: the additive recurrence of Roberts (2018), with the powers of the root of g^(P + 1) = g + 1.
     """
@@ -131,36 +170,88 @@ def spread(ranges: list[Range], starts: int) -> np.ndarray:
     return np.concatenate([first, 0.125 + 0.75 * even])
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Look:
+    """The residuals at one place: `x` [P], `residual` [n], `jacobian` [n, P], and whether the model's outcome was clean."""
+
+    x: jax.Array
+    residual: jax.Array
+    jacobian: jax.Array
+    clean: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Search:
+    """A search from one start: where it looks next, the best place so far, its damping, whether it is done, its looks."""
+
+    trial: jax.Array
+    kept: Look
+    damping: jax.Array
+    done: jax.Array
+    looks: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ends:
+    """Where the searches from S starts ended.
+
+    Attributes:
+      x: places [S, P], in units of the ranges.
+      cost: sum of squared residuals [S].
+      jacobian: [S, n, P].
+      clean: whether the model's outcome was clean [S].
+      done: whether the search converged [S].
+      looks: how often it evaluated the residuals [S].
+    """
+
+    x: jax.Array | np.ndarray
+    cost: jax.Array | np.ndarray
+    jacobian: jax.Array | np.ndarray
+    clean: jax.Array | np.ndarray
+    done: jax.Array | np.ndarray
+    looks: jax.Array | np.ndarray
+
+
 def climb(
     residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
     starts: jax.Array,
     size: int,
     seen: jax.Array,
     noise: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]:
-    """From each start [S, P], in units of the ranges: where it ends; the cost, the Jacobian and whether the model was clean
-    there; whether it has converged, and after how many looks.
+) -> Ends:
+    """Minimises the squared residuals from every start [S, P], in units of the ranges.
 
-    `residuals` of one x gives r [size], of which `seen` count, and whether the model was clean. A climb has converged where
-    a step promises less than 1e-4 sigma^2, or, at a kink, where steps gain nothing however short. `noise` NaN: sigma is the
-    residual's own.
+    Args:
+      residuals: maps one x [P] to the residuals r [size] and whether the model's outcome was clean.
+      starts: where to begin, [S, P].
+      size: how many residuals there are.
+      seen: how many of them are data; the others are 0.
+      noise: standard deviation of the data (m), or NaN to take it from the residuals.
+
+    Returns:
+      Where the searches ended. A search has converged where a step promises less than 1e-4 sigma^2, or where steps gain
+      nothing however short, as at a kink.
     """
 
-    def look(x: jax.Array) -> Any:
-        def twice(x: jax.Array) -> Any:
+    def look(x: jax.Array) -> Look:
+        def twice(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             r, clean = residuals(x)
             return r, (r, clean)
 
         jacobian, (r, clean) = jax.jacfwd(twice, has_aux=True)(x)
-        return x, r, jacobian, clean
+        return Look(x, r, jacobian, clean)
 
-    def advance(state: Any) -> Any:
-        trial, kept, damping, ready, count = state
-        new = look(trial)
+    def advance(state: _Search) -> _Search:
+        new, old = look(state.trial), state.kept
         # The sum is exact where the difference of the costs would be rounded off.
-        better = (count == 0) | (jnp.sum((kept[1] - new[1]) * (kept[1] + new[1])) > 0)
-        x, r, jacobian, clean = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, kept)
-        damping = jnp.clip(jnp.where(better, damping / 8, damping * 8), 1e-5, 1e8)
+        gain = jnp.sum((old.residual - new.residual) * (old.residual + new.residual))
+        better = (state.looks == 0) | (gain > 0)
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        x, r, jacobian = kept.x, kept.residual, kept.jacobian
+        damping = jnp.clip(jnp.where(better, state.damping / 8, state.damping * 8), 1e-5, 1e8)
         slope, curve = jacobian.T @ r, jacobian.T @ jacobian
         held = ((x <= 0) & (slope > 0)) | ((x >= 1) & (slope < 0))
         slope = jnp.where(held, 0, slope)
@@ -172,38 +263,46 @@ def climb(
         sigma2 = jnp.where(jnp.isnan(noise), jnp.sum(r * r) / (seen - x.size), noise**2)
         near = (-jnp.sum(slope * step) < _NEAR * sigma2) & (damping < 1)
         done = near | (jnp.max(jnp.abs(trial - x)) < _FINE)
-        after = trial, (x, r, jacobian, clean), damping, done, count + 1
-        return jax.tree.map(lambda a, b: jnp.where(ready, a, b), state, after)
+        after = _Search(trial, kept, damping, done, state.looks + 1)
+        return jax.tree.map(lambda a, b: jnp.where(state.done, a, b), state, after)
 
-    def goes_on(state: Any) -> jax.Array:
-        return jnp.any(~state[3] & (state[4] < _LOOKS))
+    def goes_on(state: _Search) -> jax.Array:
+        return jnp.any(~state.done & (state.looks < _LOOKS))
 
     many, free = starts.shape
     r, jacobian = jnp.zeros((many, size), starts.dtype), jnp.zeros((many, size, free), starts.dtype)
     no = jnp.zeros(many, bool)
-    begin = (starts, (starts, r, jacobian, no), jnp.full(many, 0.1, starts.dtype), no, jnp.zeros(many, jnp.int32))
-    _, (x, r, jacobian, clean), _, done, count = lax.while_loop(goes_on, jax.vmap(advance), begin)
-    return x, jnp.sum(r * r, axis=1), jacobian, clean, done, count
+    damping, looks = jnp.full(many, 0.1, starts.dtype), jnp.zeros(many, jnp.int32)
+    begin = _Search(starts, Look(starts, r, jacobian, no), damping, no, looks)
+    end = lax.while_loop(goes_on, jax.vmap(advance), begin)
+    at = end.kept
+    return Ends(at.x, jnp.sum(at.residual * at.residual, axis=1), at.jacobian, at.clean, end.done, end.looks)
 
 
 def conclude(
     ranges: list[Range],
-    ends: np.ndarray,
-    costs: np.ndarray,
-    jacobians: np.ndarray,
-    clean: np.ndarray,
-    done: np.ndarray,
+    ends: Ends,
     seen: int,
     noise: float | None,
     calls: int,
     model: Callable[[np.ndarray], Model],
     reference: Reference | None,
 ) -> Calibration[Model]:
-    """The best of several climbs, and what is to be said of it; `model` makes one of values, and `reference` tells how far
-    the grid puts them off."""
-    costs = np.nan_to_num(costs.astype(float), nan=1e30, posinf=1e30)
+    """Chooses the best of several searches and states its errors and its verdict.
+
+    Args:
+      ranges: the free parameters, P of them.
+      ends: where the searches ended.
+      seen: how many residuals are data.
+      noise: standard deviation of the data (m), or None to take it from the residuals.
+      calls: how many times the model was run.
+      model: makes the model of values [P].
+      reference: evaluates a model on two grids, to find the grid's part of the errors; None leaves it unknown.
+    """
+    costs = np.nan_to_num(np.asarray(ends.cost, float), nan=1e30, posinf=1e30)
     best = int(np.argmin(costs))
-    x, cost, jacobian = ends[best].astype(float), float(costs[best]), np.nan_to_num(jacobians[best].astype(float))
+    x, cost, done = np.asarray(ends.x[best], float), float(costs[best]), np.asarray(ends.done)
+    jacobian = np.nan_to_num(np.asarray(ends.jacobian[best], float))
     names, low, high = [r.name for r in ranges], np.array([r.low for r in ranges]), np.array([r.high for r in ranges])
     spare = seen - len(ranges)
     sigma = math.sqrt(cost / spare) if noise is None else noise
@@ -219,7 +318,7 @@ def conclude(
         verdict |= Verdict.NOT_TOLD
     if np.any((np.abs(x - 0.5) > 0.499) & ~hidden):
         verdict |= Verdict.AT_LIMIT
-    apart = np.sum(((ends - x) @ (ways[:, told] * np.sqrt(curves[told]))) ** 2, axis=1)
+    apart = np.sum(((np.asarray(ends.x) - x) @ (ways[:, told] * np.sqrt(curves[told]))) ** 2, axis=1)
     if np.any(done & (costs - cost < 4 * sigma**2) & (apart > 25)):
         verdict |= Verdict.AMBIGUOUS
     if noise is None and spare < _SPARE:
@@ -256,6 +355,6 @@ def conclude(
         residual=math.sqrt(cost / seen),
         noise=sigma,
         calls=calls,
-        verdict=verdict if clean[best] else verdict | Verdict.UNCLEAN,
+        verdict=verdict if ends.clean[best] else verdict | Verdict.UNCLEAN,
         model=model(values),
     )

@@ -1,13 +1,13 @@
-"""Where a fit would end on an ever finer grid, from two grids of a reference that converges to first order.
+"""Where a fit would end on an infinitely fine grid, from two grids of a reference model that converges to first order.
 
-The data d are fitted by a model of its own grid, at x0 with the Jacobian J, W = (J^T J)^-1 J^T. The reference's heights m on
-a coarse grid and on one r times as fine tell its limit, m_fine + b with b = (m_fine - m_coarse) / (r - 1) (Richardson 1911,
-doi:10.1098/rsta.1911.0009), and the fit moves to x with W (m_fine + b - d) = 0: the data weigh there as they do at x0, so
-that their noise hardly counts in x - x0. It is found by steps dx = -W (m_fine + b - d), which need no derivative of the
-reference; where a step turns back, the next are halved.
+The data d were fitted by a model on its own grid, which gave x0 with the Jacobian J; let W = (J^T J)^-1 J^T. The reference
+model predicts m_coarse on one grid and m_fine on a grid r times as fine. Its limit is m_fine + b, where
+b = (m_fine - m_coarse) / (r - 1) (Richardson 1911, doi:10.1098/rsta.1911.0009). The fit in the limit is the x at which
+W (m_fine + b - d) = 0. Since the data enter with the same weights W as at x0, their noise hardly counts in x - x0. The steps
+dx = -W (m_fine + b - d) find x without derivatives of the reference; where a step turns back, the next ones are halved.
 
-What is extrapolated, W b, is trusted to its half. Where a kink (a toe, a crest) comes to lie in the middle of a cell, or on
-its edge, two grids may agree by luck: so W b is taken a little to either side too, and its largest counts.
+Half of the extrapolated part, W b, is taken as its uncertainty. Where a kink (a toe, a crest) lies in the middle of a cell
+or on its edge, two grids may agree by chance: so W b is also computed a little to either side, and the largest counts.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _ASIDE = 0.04  # of the ranges: by how much kinks are moved
 
 @dataclass(frozen=True)
 class Limit:
-    """Where the fit ends in the limit of fine grids, and what may be wrong of that (either way), in units of the ranges."""
+    """The fit on an infinitely fine grid, `x` [P], and the uncertainty of `x`, `doubt` [P], both in units of the ranges."""
 
     x: np.ndarray
     doubt: np.ndarray
@@ -34,8 +34,18 @@ class Limit:
 def seek_limit(
     start: np.ndarray, way: np.ndarray, noise: np.ndarray, told: np.ndarray, reference: Reference
 ) -> Limit | None:
-    """The limit's fit, from `start` [P] by W = `way` [P, n]; `noise` [P] is the error that noise makes, `told` [P] which
-    parameters the data tell. None where the reference is not clean, leaves the ranges (0 to 1), or is not found."""
+    """Finds the fit on an infinitely fine grid, or None.
+
+    Args:
+      start: the fit on the model's own grid, [P], in units of the ranges.
+      way: W = (J^T J)^-1 J^T, [P, n].
+      noise: the standard errors that the data's noise causes, [P].
+      told: which parameters the data determine, [P] bool; the others stay where they are.
+      reference: evaluates the reference model on both grids.
+
+    Returns:
+      The limit; None where the reference's outcome is not clean, a parameter leaves its range, or no limit is found.
+    """
 
     def look(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         fine, beyond, clean = reference(x)

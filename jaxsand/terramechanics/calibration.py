@@ -1,15 +1,17 @@
-"""Parameters of sand and tool from height maps before and after a push or a collapse; see _least_squares.py for the
-method."""
+"""Estimates parameters of sand and tool from height maps before and after a push or a collapse.
+
+_least_squares.py has the method.
+"""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxsand.interaction.simulate import Push, check_push, rollout
 from jaxsand.relaxation.schemes import Scheme
@@ -18,27 +20,59 @@ from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, concrete, fit
 from jaxsand.scene.tools import NoTool
-from jaxsand.terramechanics._least_squares import Calibration, Range, as_ranges, check_noise, climb, conclude, spread
+from jaxsand.terramechanics._least_squares import (
+    Calibration,
+    Ends,
+    Free,
+    Range,
+    as_ranges,
+    check_noise,
+    climb,
+    conclude,
+    spread,
+)
 from jaxsand.terramechanics._limit import Reference
 from jaxsand.terramechanics.finer import OneGrid, TwoGrids, divide, finer, isotropic, means, resolve
 
-Free = Sequence[str] | Mapping[str, tuple[float, float]]
 _REPOSE = "repose_angle"
 _TWO = TwoGrids()
 _FINER = 3  # an odd number: cells of both grids have their middles in common
 _ANGLES = (math.radians(10), math.radians(50))
 _Rules = tuple[Push | None, Scheme | None, Stop | None]
-_Group = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # before, after, seen [k, H, W]; strokes [k, n, 4]
+_Labels = np.ndarray | jax.Array | None
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Group:
+    """Trials of equally many strokes: `before`, `after` and `seen` [k, H, W], and `strokes` [k, n, 4]."""
+
+    before: jax.Array
+    after: jax.Array
+    seen: jax.Array
+    strokes: jax.Array
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A height map [H, W] (m) `before`, one `after`, and the `stroke` between them: none (the sand settles), [4], or [n, 4]
-    for pushes one after the other, each x0, y0, x1, y1 (m). NaN in `after` was not seen; `before` is taken as it is."""
+    """One experiment for `calibrate`: a height map before, the pushes made, and the height map after.
 
-    before: Any
-    after: Any
-    stroke: Any = None
+    Args:
+      before: heights [H, W] (m); `height[i, j]` is the cell centred at x = (j + 1/2) dx, y = (i + 1/2) dx. Must be finite.
+      after: heights [H, W] (m) at rest; NaN in cells that were not seen.
+      stroke: x0, y0, x1, y1 (m) of one push [4], or of pushes one after the other [n, 4]; None where the sand only settles.
+
+    Example:
+      >>> column = np.zeros((8, 8))
+      >>> column[3:5, 3:5] = 0.02
+      >>> trial = js.Trial(before=column, after=np.zeros((8, 8)))
+      >>> trial.stroke is None
+      True
+    """
+
+    before: ArrayLike | jax.Array
+    after: ArrayLike | jax.Array
+    stroke: ArrayLike | jax.Array | None = None
 
 
 def calibrate(
@@ -46,7 +80,7 @@ def calibrate(
     trials: Trial | Sequence[Trial],
     *,
     free: Free = (_REPOSE, "width", "depth"),
-    regions: Any = None,
+    regions: ArrayLike | jax.Array | None = None,
     noise: float | None = None,
     starts: int = 6,
     push: Push | None = None,
@@ -54,29 +88,51 @@ def calibrate(
     stop: Stop | None = None,
     grid: TwoGrids | OneGrid = _TWO,
 ) -> Calibration[Scene]:
-    """The parameters with which the simulator best explains what was seen, in least squares over all cells of all trials.
+    """Finds the parameters with which the simulator best explains what was seen.
+
+    Minimises sum (h(x) - after)^2 over the seen cells of all trials, h(x) the simulated map for parameters x.
 
     Args:
-      scene: what is known, and the guess of what is free, from which the first start sets out.
-      trials: one or several, which share the parameters.
-      free: "repose_angle" and fields of the tool; or these with their ranges (low, high), which are not left. By default 10
-        to 50 degrees for the angle of repose, and a third to three times the guess for others.
-      regions: labels [H, W] from 0 to R - 1, for an angle of repose each: repose_angle[0], repose_angle[1], ...
-      noise: sigma (m) of the white noise in `after`; by default it is estimated from the residual.
-      starts: how many; those after the first are spread over the ranges.
-      push, scheme, stop: as in `jaxsand.step`.
-      grid: `TwoGrids()` finds the grid's part of the errors: the fit is repeated with isotropic sand at rest on the scene's
-        grid and on one three times as fine. `OneGrid()` leaves it unknown.
+      scene: what is known; what is free starts from the values in it.
+      trials: one or several experiments, which share the parameters.
+      free: "repose_angle" and names of fields of the tool; or a mapping of these to their ranges (low, high), which the
+        estimates never leave. By default the range is 10 to 50 degrees for the angle of repose, and a third to three times
+        the scene's value for others.
+      regions: labels [H, W] from 0 to R - 1 of regions with an angle of repose each; the parameters are then called
+        repose_angle[0], repose_angle[1], ...
+      noise: standard deviation (m) of the white noise in `after`; None estimates it from the residual.
+      starts: how many searches are made; those after the first begin at places spread over the ranges.
+      push, scheme, stop: how the simulator pushes and settles, as in `jaxsand.step`.
+      grid: `TwoGrids()` also finds the error that the scene's grid causes, by repeating the fit with isotropic sand on the
+        scene's grid and on one three times as fine. `OneGrid()` leaves it unknown and takes less time.
 
-    The standard errors hold white noise in `after` and the grid's own error: its spacing, and its neighbourhood, whose error
-    no refinement takes away. So the `values` are those of this simulator, and `sand` has the sand's own. Where the grid's
-    part could not be found the verdict says GRID_UNKNOWN. Other errors of the model are not in the errors: its rule of
-    pushing, noise in `before`. Computes in the dtype of the maps; float32 will do. To learn what an experiment could tell
-    before it is made, give its own simulated `after`, and the noise: `noise_errors` are then the Cramer-Rao bound.
+    Returns:
+      A `Calibration`: `values` and their standard `errors` by name, the `verdict`, and the scene with the values put in as
+      `model`. `values` are those of the simulator on this grid and `sand` those of the real sand. The errors hold white
+      noise in `after` and the grid's error (of its spacing and of its neighbourhood). They do not hold other errors of the
+      model, such as its rule of pushing, nor noise in `before`. Data that do not determine a parameter, or that no
+      parameters
+      explain, raise nothing: the verdict says so.
 
     Raises:
-      ValueError: names the field, the value and the remedy. Data that do not tell a parameter, or that no parameters
-        explain, raise nothing: the `verdict` says so.
+      ValueError: names the argument, its value and the remedy.
+
+    Computes in the dtype of the maps; float32 will do. To learn what an experiment could tell before it is made, give a
+    simulated `after` and the noise: `noise_errors` are then the Cramer-Rao bound.
+
+    Source: Levenberg 1944; Marquardt 1963, doi:10.1137/0111030; for the grid's error Richardson 1911,
+    doi:10.1098/rsta.1911.0009.
+
+    Example:
+      >>> column = jnp.zeros((9, 9)).at[3:6, 3:6].set(0.03)
+      >>> sand = js.make_scene((9, 9), 0.01, repose_angle=math.radians(30), neighbours=4)
+      >>> guess = js.make_scene((9, 9), 0.01, repose_angle=math.radians(27), neighbours=4)
+      >>> trial = js.Trial(column, js.settle(sand, column).height)
+      >>> found = js.calibrate(guess, trial, free=["repose_angle"])  # doctest: +SKIP
+      >>> round(math.degrees(found.values["repose_angle"]), 2)  # doctest: +SKIP
+      30.0
+
+    The last two lines are not run by the tests: compiling the model and its derivatives takes 10 s and more.
     """
     some = [trials] if isinstance(trials, Trial) else list(trials)
     check_whole("starts", starts, 1)
@@ -91,40 +147,49 @@ def calibrate(
     ranges, names = _ranges(scene, free, 0 if labels is None else int(labels.max()) + 1)
     if seen <= len(ranges):
         raise ValueError(f"trials: got {seen} seen cells for {len(ranges)} free parameters; give more, or free fewer")
-    dtype = groups[0][0].dtype
+    dtype = groups[0].before.dtype
     box = jnp.asarray([[r.low for r in ranges], [r.high for r in ranges]], dtype)
     begin, sigma = jnp.asarray(spread(ranges, starts), dtype), jnp.asarray(math.nan if noise is None else noise, dtype)
     rules = (push, scheme, stop)
-    found = _climbs(scene, rules, labels, groups, box, begin, jnp.asarray(seen, dtype), sigma, names)
-    ends, costs, jacobians, clean, done, count = (np.asarray(part) for part in found)
+    ends = _climbs(scene, rules, labels, groups, box, begin, jnp.asarray(seen, dtype), sigma, names)
 
     def model(values: np.ndarray) -> Scene:
         return _with(scene, names, labels, jnp.asarray(values, dtype))
 
-    calls = int(count.sum()) * len(some)
+    calls = int(ends.looks.sum()) * len(some)
     reference = _reference(scene, push, labels, groups, box, names) if isinstance(grid, TwoGrids) else None
-    return conclude(ranges, ends, costs, jacobians, clean, done, seen, noise, calls, model, reference)
+    return conclude(ranges, ends, seen, noise, calls, model, reference)
 
 
 @partial(jax.jit, static_argnames="names")
 def _climbs(
-    scene: Scene, rules: _Rules, labels: Any, groups: list[_Group], box: Any, begin: Any, seen: Any, noise: Any, names: Any
-) -> Any:
+    scene: Scene,
+    rules: _Rules,
+    labels: _Labels,
+    groups: list[_Group],
+    box: jax.Array,
+    begin: jax.Array,
+    seen: jax.Array,
+    noise: jax.Array,
+    names: tuple[str, ...],
+) -> Ends:
     def residuals(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = _with(scene, names, labels, box[0] + x * (box[1] - box[0]))
         return _misfits(there, rules, groups)
 
-    return climb(residuals, begin, sum(before.size for before, *_ in groups), seen, noise)
+    return climb(residuals, begin, sum(group.before.size for group in groups), seen, noise)
 
 
-def _reference(scene: Scene, push: Push | None, labels: Any, groups: list[_Group], box: Any, names: Any) -> Reference:
-    """Isotropic sand, brought to rest, on the scene's grid and on a finer one."""
+def _reference(
+    scene: Scene, push: Push | None, labels: _Labels, groups: list[_Group], box: jax.Array, names: tuple[str, ...]
+) -> Reference:
+    """Runs isotropic sand on the scene's grid and on a finer one, for `seek_limit`."""
     coarse = isotropic(scene)
     split = None if labels is None else divide(labels, _FINER)
     resolved = jax.vmap(lambda before: resolve(scene, before, _FINER))
     grids = (
         (coarse, labels, groups),
-        (finer(coarse, _FINER), split, [(resolved(before), *rest) for before, *rest in groups]),
+        (finer(coarse, _FINER), split, [replace(group, before=resolved(group.before)) for group in groups]),
     )
 
     def reference(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -137,23 +202,27 @@ def _reference(scene: Scene, push: Push | None, labels: Any, groups: list[_Group
 
 
 @partial(jax.jit, static_argnames="names")
-def _refers(scene: Scene, labels: Any, groups: list[_Group], push: Push | None, values: Any, names: Any) -> Any:
+def _refers(
+    scene: Scene, labels: _Labels, groups: list[_Group], push: Push | None, values: jax.Array, names: tuple[str, ...]
+) -> tuple[jax.Array, jax.Array]:
     return _misfits(_with(scene, names, labels, values), (push, None, None), groups)
 
 
 def _misfits(scene: Scene, rules: _Rules, groups: list[_Group]) -> tuple[jax.Array, jax.Array]:
-    """What the scene makes of the maps before less what was seen, in the cells that were seen, and whether it is clean; the
-    scene's cells may be parts of these."""
+    """The differences between simulated and seen heights, 0 in unseen cells, and whether all outcomes are clean.
+
+    A scene on a finer grid than the data's is averaged over the data's cells first.
+    """
     misfits, outcomes = [], []
-    for before, after, sees, strokes in groups:
-        height, outcome = _run(scene, rules, before, strokes)
-        misfits.append(jnp.where(sees, means(height, sees[0].shape) - after, 0).ravel())
+    for group in groups:
+        height, outcome = _run(scene, rules, group.before, group.strokes)
+        misfits.append(jnp.where(group.seen, means(height, group.seen[0].shape) - group.after, 0).ravel())
         outcomes.append(outcome)
     return jnp.concatenate(misfits), jnp.all(jnp.concatenate(outcomes) == 0)
 
 
 def _run(scene: Scene, rules: _Rules, before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What the maps [k, H, W] become, and the outcomes."""
+    """The maps [k, H, W] after the pushes, and the outcomes [k]."""
     push, scheme, stop = rules
 
     def one(before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -166,26 +235,25 @@ def _run(scene: Scene, rules: _Rules, before: jax.Array, strokes: jax.Array) -> 
     return jax.vmap(one)(before, strokes)
 
 
-def _with(scene: Scene, names: tuple[str, ...], labels: Any, values: jax.Array) -> Scene:
-    """The scene with these values of what is free: angles of repose first, if any."""
+def _with(scene: Scene, names: tuple[str, ...], labels: _Labels, values: jax.Array) -> Scene:
+    """The scene with the given values of the free parameters; angles of repose, if any, come first in `values`."""
     fields_of_tool = [name for name in names if name != _REPOSE]
     angles = values[: values.size - len(fields_of_tool)]
     if angles.size:
         scene = replace(scene, material=Material(angles[0] if labels is None else angles[labels]))
     if fields_of_tool:
-        tool: Any = scene.tool
-        scene = replace(scene, tool=replace(tool, **dict(zip(fields_of_tool, values[angles.size :], strict=True))))
+        scene = replace(scene, tool=replace(scene.tool, **dict(zip(fields_of_tool, values[angles.size :], strict=True))))
     return scene
 
 
 def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
-    """Trials of as many strokes, stacked; and the number of cells seen."""
+    """Stacks the trials that have equally many strokes, and counts the seen cells."""
     if not trials:
         raise ValueError("trials: got none; give at least one Trial(before, after, stroke)")
     for trial in trials:
         if not isinstance(trial, Trial):
             raise ValueError(f"trials: got {type(trial).__name__}; give Trial(before, after, stroke), or several")
-    groups: dict[int, list[Any]] = {}
+    groups: dict[int, list[_Group]] = {}
     dtype = jnp.result_type(*(as_array("before", trial.before) for trial in trials))
     for trial in trials:
         try:
@@ -205,12 +273,12 @@ def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
             raise ValueError(f"after: got shape {list(after.shape)}; give one like before's, {list(before.shape)}")
         seen = jnp.isfinite(after)
         strokes = strokes.reshape(-1, 4)
-        groups.setdefault(strokes.shape[0], []).append((before, jnp.where(seen, after, 0), seen, strokes))
-    stacked: Any = [tuple(jnp.stack(part) for part in zip(*some, strict=True)) for some in groups.values()]
-    return stacked, sum(int(group[2].sum()) for group in stacked)
+        groups.setdefault(strokes.shape[0], []).append(_Group(before, jnp.where(seen, after, 0), seen, strokes))
+    stacked = [jax.tree.map(lambda *parts: jnp.stack(parts), *some) for some in groups.values()]
+    return stacked, sum(int(group.seen.sum()) for group in stacked)
 
 
-def _labels(scene: Scene, regions: Any) -> np.ndarray | None:
+def _labels(scene: Scene, regions: ArrayLike | jax.Array | None) -> np.ndarray | None:
     if regions is None:
         return None
     labels = np.asarray(regions)

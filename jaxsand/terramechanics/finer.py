@@ -1,11 +1,10 @@
-"""A scene and its maps on a finer grid, and back.
+"""A scene and its maps on a finer grid, and averages back on the coarse one.
 
-Neighbourhoods of 4 and 8 have an error that no refinement takes away: a pile grown at a point is x1.162 and x1.036 as high
-as the cone. Only isotropic sand converges to it (flux.py), to first order in the spacing.
+Neighbourhoods of 4 and 8 cells have an error that no refinement takes away: a pile grown at a point becomes 1.162 and 1.036
+times as high as the exact cone. Only isotropic sand converges to the cone (flux.py), to first order in the spacing.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,21 +18,33 @@ from jaxsand.scene.window import Window
 
 @dataclass(frozen=True)
 class TwoGrids:
-    """The grid's error is told from what isotropic sand does on the scene's grid and on one three times as fine."""
+    """Tells `calibrate` to find the grid's error, from isotropic sand on the scene's grid and on one three times as fine.
+
+    Example:
+      >>> js.TwoGrids()
+      TwoGrids()
+    """
 
 
 @dataclass(frozen=True)
 class OneGrid:
-    """The grid's error stays unknown: the verdict says so, and only the noise's part of the error bars is a number."""
+    """Tells `calibrate` to leave the grid's error unknown: it runs faster, and its errors hold the noise's part alone.
+
+    Example:
+      >>> trial = js.Trial(np.zeros((8, 8)), np.zeros((8, 8)))
+      >>> js.calibrate(js.make_scene((8, 8), 0.01), trial, free=["repose_angle"], grid=js.OneGrid())  # doctest: +SKIP
+
+    The last line is not run by the tests: compiling takes 5 s and more.
+    """
 
 
 def isotropic(scene: Scene) -> Scene:
-    """The scene with isotropic sand."""
+    """The scene with isotropic sand in place of 4 or 8 neighbours."""
     return replace(scene, grid=replace(scene.grid, neighbours="isotropic"))
 
 
 def finer(scene: Scene, times: int) -> Scene:
-    """The scene on a grid so many times as fine, with the angle of repose of every cell, and solid where it is."""
+    """The scene on a grid `times` as fine; each new cell takes the angle of repose, and the wall, of the cell it lies in."""
     rows, columns = scene.grid.shape
     grid = Grid(scene.grid.spacing / times, (times * rows, times * columns), scene.grid.neighbours)
     material, walls, window = scene.material, scene.walls, scene.window
@@ -46,17 +57,18 @@ def finer(scene: Scene, times: int) -> Scene:
     return replace(scene, grid=grid, material=material, walls=walls, window=window)
 
 
-def divide(cells: Any, times: int) -> jax.Array:
-    """A map [H, W] with every cell divided into times^2: [times H, times W]."""
+def divide(cells: jax.typing.ArrayLike, times: int) -> jax.Array:
+    """Repeats every cell of a map [H, W] `times` along both axes: [times H, times W]."""
     return jnp.repeat(jnp.repeat(jnp.asarray(cells), times, axis=0), times, axis=1)
 
 
 def resolve(scene: Scene, height: jax.Array, times: int) -> jax.Array:
-    """A map [H, W] of the scene as means over the cells of a grid so many times as fine, [times H, times W].
+    """Interpolates a map [H, W] of the scene on a grid `times` as fine, [times H, times W], keeping the mean of every cell.
 
-    Each cell is a plane through its mean, along x and along y with the lesser of the differences to both sides, level where
-    these have different signs (van Leer 1979, doi:10.1016/0021-9991(79)90145-1, with minmod): means are kept, steps stay
-    sharp, and a flank at repose is no staircase. Next to solid cells and to the edge a cell is level.
+    Within a cell the map is a plane through its mean. Its slope along x and along y is the smaller of the differences to the
+    two neighbours, or 0 where these differ in sign (van Leer 1979, doi:10.1016/0021-9991(79)90145-1, with the minmod
+    limiter). So steps stay sharp, and a flank at repose does not become a staircase. Cells next to solid cells or to the
+    edge are level.
     """
     rows, columns = height.shape
     sand = jnp.where(scene.walls.solid, jnp.nan, height) if isinstance(scene.walls, Walls) else height
@@ -67,14 +79,14 @@ def resolve(scene: Scene, height: jax.Array, times: int) -> jax.Array:
 
 
 def _slope(height: jax.Array, axis: int) -> jax.Array:
-    """The lesser of the differences to both sides, where they agree in sign."""
+    """The smaller of the differences to both neighbours along an axis, 0 where they differ in sign."""
     first, last = jnp.take(height, jnp.asarray([0]), axis), jnp.take(height, jnp.asarray([-1]), axis)
     back, ahead = jnp.diff(height, axis=axis, prepend=first), jnp.diff(height, axis=axis, append=last)
     return jnp.where(back * ahead > 0, jnp.where(jnp.abs(back) < jnp.abs(ahead), back, ahead), 0)
 
 
 def means(height: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """The means of maps [..., k H, k W] over the cells of a grid of `shape` (H, W)."""
+    """Averages maps [..., k H, k W] over the cells of a grid of `shape` (H, W)."""
     rows, columns = shape
     parts = height.reshape(*height.shape[:-2], rows, height.shape[-2] // rows, columns, height.shape[-1] // columns)
     return parts.mean((-3, -1))

@@ -8,11 +8,12 @@ Grisso & Desai 1983, "A soil-tool model based on limit equilibrium analysis", Tr
 
 Wheel: the pressure-sinkage relation of Bekker 1956, "Theory of Land Locomotion", and the shear of Janosi & Hanamoto 1961,
 integrated over the contact of a rigid wheel as in Wong & Reece 1967, J. Terramechanics 4.
-Quasi-static. Everything takes scalars, under jit and vmap too; what is being traced is not checked."""
+
+The forces are quasi-static. All functions take scalars and work under jit, grad and vmap; traced values are not checked.
+"""
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,25 @@ _TINY = float(np.finfo(np.float32).tiny)
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Soil:
-    """Strength of a soil (Mohr-Coulomb), its hold on a blade, and how it yields under a wheel (Bekker, Janosi-Hanamoto)."""
+    """The strength of a soil (Mohr-Coulomb), its hold on a blade, and how it yields under a wheel (Bekker, Janosi-Hanamoto).
+
+    Args:
+      unit_weight: g, density times gravity (N/m^3).
+      friction: phi, angle of internal friction (rad).
+      cohesion: c (Pa).
+      interface_friction: delta, angle of friction of the soil on the blade (rad).
+      adhesion: c_a, of the soil to the blade (Pa).
+      cohesive_modulus: k_c of Bekker's pressure-sinkage relation (N/m^(n+1)).
+      frictional_modulus: k_phi of the same relation (N/m^(n+2)).
+      exponent: n, of the sinkage in the same relation.
+      shear_displacement: K, the length over which shear stress builds up (m).
+
+    Example:
+      >>> import dataclasses
+      >>> clean = dataclasses.replace(js.forces.WONG_DRY_SAND, cohesion=0.0)
+      >>> clean.cohesion
+      0.0
+    """
 
     unit_weight: Scalar  # g: density times gravity, N/m^3
     friction: Scalar  # phi: angle of internal friction, rad
@@ -56,9 +75,18 @@ LETE_SAND = Soil(15.7e3, math.radians(31.1), 1.3e3, math.radians(31.1) * 2 / 3, 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Cut:
-    """A cut `depth` (m) deep by a blade of `width` (m) and `rake` (rad; pi/2 is upright) under a `surcharge` (Pa).
+    """A cut by a straight blade, as `cut_force` takes it.
 
-    `sides` counts the upright faces along which the wedge tears off: 0 in plane strain (a wide blade), 2 in the open.
+    Args:
+      depth: of the blade's lower edge below the level surface (m).
+      width: of the blade (m).
+      rake: angle of the blade's face from the horizontal (rad); pi/2 is upright.
+      surcharge: pressure of a heap on the surface (Pa).
+      sides: how many upright faces the wedge tears off along: 0 in plane strain (a wide blade), 2 in the open.
+
+    Example:
+      >>> js.forces.Cut(depth=0.02, width=0.1).sides
+      0.0
     """
 
     depth: Scalar
@@ -71,7 +99,17 @@ class Cut:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class BladeForce:
-    """Force of the soil on a blade, N: against its travel, and upward. A steep blade is lifted, a flat one drawn in."""
+    """The force of the soil on a blade (N); a steep blade is lifted, a flat one is drawn in.
+
+    Attributes:
+      draught: against the blade's travel (N).
+      lift: upward (N).
+
+    Example:
+      >>> force = js.forces.cut_force(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.02, width=0.1))
+      >>> bool(force.draught > force.lift > 0)
+      True
+    """
 
     draught: jax.Array
     lift: jax.Array
@@ -80,7 +118,19 @@ class BladeForce:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class WheelForce:
-    """Load carried (N), drawbar pull (N), torque (N m), compaction resistance (N): the pull is shear less resistance."""
+    """The forces of the soil on a driven wheel.
+
+    Attributes:
+      load: carried (N).
+      pull: drawbar pull (N), the shear thrust less the resistance.
+      torque: on the axle (N m).
+      resistance: compaction resistance (N).
+
+    Example:
+      >>> force = js.forces.wheel_force(js.forces.WONG_DRY_SAND, 0.048, 0.05, sinkage=0.01, slip=0.2)
+      >>> bool(force.load > force.resistance > 0)
+      True
+    """
 
     load: jax.Array
     pull: jax.Array
@@ -89,9 +139,25 @@ class WheelForce:
 
 
 def wedge_factors(soil: Soil, rake: Scalar, angle: Scalar) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """N_g, N_c, N_ca and N_q at a failure angle b, where S = sin(a + b + phi + delta) > 0 (McKyes 1985, multiplied out).
+    """The factors N_g, N_c, N_ca and N_q of the earthmoving equation at a given failure angle.
 
-    N_q = (cot a + cot b) sin(b + phi) / S, N_g = N_q / 2, N_c = cos phi / (sin b S), N_ca = -cos(a + b + phi) / (sin a S).
+    N_q = (cot a + cot b) sin(b + phi) / S, N_g = N_q / 2, N_c = cos phi / (sin b S), N_ca = -cos(a + b + phi) / (sin a S),
+    with S = sin(a + b + phi + delta), which must be above 0.
+
+    Args:
+      soil: gives phi and delta.
+      rake: a, of the blade's face from the horizontal (rad).
+      angle: b, of the failure surface from the horizontal (rad).
+
+    Returns:
+      N_g, N_c, N_ca, N_q (no unit). Differentiable in all arguments.
+
+    Source: McKyes 1985, "Soil Cutting and Tillage", multiplied out.
+
+    Example:
+      >>> weight, cohesion, adhesion, surcharge = js.forces.wedge_factors(js.forces.WONG_DRY_SAND, math.pi / 2, 0.5)
+      >>> bool(jnp.isclose(weight, surcharge / 2))
+      True
     """
     slide = angle + jnp.asarray(soil.friction)
     total = jnp.sin(rake + slide + soil.interface_friction)
@@ -101,12 +167,27 @@ def wedge_factors(soil: Soil, rake: Scalar, angle: Scalar) -> tuple[jax.Array, j
 
 
 def failure_angle(soil: Soil, cut: Cut) -> jax.Array:
-    """The failure angle b of least force, in (0, pi - a - phi - delta), or NaN if that is empty; a constant to derivatives.
-    Found on six nested grids of 33 angles, each between the neighbours of the best so far."""
+    """The angle b of the failure surface at which the force on the blade is least.
+
+    b lies in (0, pi - a - phi - delta). It is found on six nested grids of 33 angles, each between the neighbours of the
+    best angle so far.
+
+    Args:
+      soil: the soil's strength.
+      cut: the blade and its depth.
+
+    Returns:
+      b (rad), or NaN if the interval is empty, so that no wedge can slide. Derivatives treat b as a constant.
+
+    Example:
+      >>> angle = js.forces.failure_angle(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.02, width=0.1))
+      >>> round(math.degrees(angle))
+      21
+    """
     soil, cut = lax.stop_gradient((soil, cut))
     stop = math.pi - (jnp.asarray(cut.rake) + soil.friction + soil.interface_friction)
 
-    def narrow(_: Any, span: jax.Array) -> jax.Array:
+    def narrow(_: jax.Array, span: jax.Array) -> jax.Array:
         grid = span[0] + (span[1] - span[0]) * jnp.linspace(0, 1, 33, dtype=stop.dtype)
         return lax.dynamic_slice(grid, [jnp.clip(jnp.argmin(_stress(soil, cut, grid)), 1, 31) - 1], [3])[::2]
 
@@ -115,10 +196,29 @@ def failure_angle(soil: Soil, cut: Cut) -> jax.Array:
 
 
 def cut_force(soil: Soil, cut: Cut) -> BladeForce:
-    """Force on the blade: F at the angle a + delta, with the adhesion c_a d w / sin a along its face.
+    """The force of the soil on a blade that cuts, by the fundamental equation of earthmoving.
 
-    First derivatives are exact: F is least over b, so dF/dp is the partial derivative at fixed b (envelope theorem). Second
-    derivatives are not. NaN where no wedge can slide.
+    F = w (g d^2 N_g + c d N_c + c_a d N_ca + q d N_q) acts at the angle a + delta, and the adhesion c_a d w / sin a acts
+    along the blade's face; see `wedge_factors` and `failure_angle`.
+
+    Args:
+      soil: the soil's strength.
+      cut: the blade and its depth.
+
+    Returns:
+      A `BladeForce` (N); NaN where no wedge can slide. First derivatives are exact: F is least over b, so dF/dp is the
+      partial derivative at fixed b (envelope theorem). Second derivatives are not.
+
+    Raises:
+      ValueError: for a value out of range.
+
+    Source: Reece 1964, doi:10.1243/PIME_CONF_1964_179_134_02; McKyes 1985.
+
+    Example:
+      >>> shallow = js.forces.cut_force(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.01, width=0.1))
+      >>> deep = js.forces.cut_force(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.02, width=0.1))
+      >>> bool(deep.draught > 2 * shallow.draught)
+      True
     """
     _check_soil(soil)
     _check("cut.width", cut.width, _TINY, np.inf, "give metres")
@@ -133,13 +233,33 @@ def cut_force(soil: Soil, cut: Cut) -> BladeForce:
 
 
 def blade_force(scene: Scene, height: jax.typing.ArrayLike, pose: Pose, soil: Soil, level: Scalar = 0.0) -> BladeForce:
-    """Force on the scene's blade, upright and lowered at `pose`, about to move ahead; its wedge has two sides.
+    """The force of the sand on a scene's blade that stands upright at a pose and is about to move ahead.
 
-    The sand is read over the blade's width in a strip one spacing long that starts one spacing ahead of the face: along the
-    grid, no cell which the blade covers in part is read. The strip's mean of the sand between the blade's bottom and `level`
-    (m), the height of undisturbed ground, is the depth of cut. What lies above both is a heap: the weight of its mean is the
-    surcharge. A blade that moves only a heap has no cut and feels nothing; `level=jnp.inf` counts all sand as cut. Zero off
-    the map. Differentiable in height, pose and soil, except at kinks of the depth and of the coverage.
+    The sand is read over the blade's width in a strip one spacing long that begins one spacing ahead of the face, so that
+    along the grid no cell is read that the blade covers in part. The mean thickness of the sand in the strip between the
+    blade's bottom and `level` is the depth of cut. The sand above both is a heap, whose mean weight is the surcharge. The
+    wedge has two sides.
+
+    Args:
+      scene: its tool must be a `Blade`, whose lower edge lies at height -depth.
+      height: [H, W] (m), `height[i, j]` at x = (j + 1/2) dx, y = (i + 1/2) dx.
+      pose: where the blade stands (m), and the cosine and sine of its heading.
+      soil: the soil's strength.
+      level: height (m) of the undisturbed ground; `jnp.inf` counts all sand as cut.
+
+    Returns:
+      A `BladeForce` (N), 0 off the map. A blade that moves only a heap has no cut and feels nothing. Differentiable in
+      height, pose and soil, except at kinks of the depth and of the coverage.
+
+    Raises:
+      ValueError: if the scene has no blade, or a value is out of range.
+
+    Example:
+      >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade(0.04, 0.02, 0.01))
+      >>> pose = js.Pose(0.03, 0.04, 1.0, 0.0)
+      >>> force = js.forces.blade_force(scene, jnp.zeros((8, 8)), pose, js.forces.WONG_DRY_SAND)
+      >>> bool(force.draught > 0)
+      True
     """
     scene, height = fit(scene, height)
     blade, dx = scene.tool, jnp.asarray(scene.grid.spacing)
@@ -157,11 +277,34 @@ def blade_force(scene: Scene, height: jax.typing.ArrayLike, pose: Pose, soil: So
 
 
 def wheel_force(soil: Soil, radius: Scalar, width: Scalar, sinkage: Scalar, slip: Scalar) -> WheelForce:
-    """Forces on a driven rigid wheel, 0 <= slip <= 1, sunk by `sinkage` (m): contact from t_1 = acos(1 - z / r) to 0.
+    """The forces of the soil on a driven rigid wheel at a given sinkage and slip.
 
-    At the angle t from the lowest point: p = (k_c / b + k_phi)(r (cos t - cos t_1))^n, tau = (c + p tan phi)(1 - e^(-j / K))
-    after the shear displacement j = r (t_1 - t - (1 - slip)(sin t_1 - sin t)). Load and pull are the integrals over t of
-    r b (p cos t + tau sin t) and r b (tau cos t - p sin t), the torque that of r^2 b tau. Differentiable; 0 at sinkage 0.
+    The contact runs from the entry angle t_1 = acos(1 - z / r) to the lowest point, t = 0. At the angle t,
+    p = (k_c / b + k_phi)(r (cos t - cos t_1))^n and tau = (c + p tan phi)(1 - e^(-j / K)), with the shear displacement
+    j = r (t_1 - t - (1 - slip)(sin t_1 - sin t)). Load and pull are the integrals over t of r b (p cos t + tau sin t) and of
+    r b (tau cos t - p sin t), the torque is that of r^2 b tau.
+
+    Args:
+      soil: the soil's strength.
+      radius: r (m).
+      width: b (m).
+      sinkage: z (m), 0 to r.
+      slip: 1 - speed / (r times rate), 0 to 1.
+
+    Returns:
+      A `WheelForce` (N, torque in N m), 0 at sinkage 0. Differentiable in all arguments.
+
+    Raises:
+      ValueError: for a value out of range.
+
+    Source: Bekker 1956, "Theory of Land Locomotion"; Janosi & Hanamoto 1961; Wong & Reece 1967, J. Terramechanics 4.
+
+    Example:
+      >>> soil = js.forces.WONG_DRY_SAND
+      >>> slipping = js.forces.wheel_force(soil, radius=0.048, width=0.05, sinkage=0.01, slip=0.5)
+      >>> gripping = js.forces.wheel_force(soil, radius=0.048, width=0.05, sinkage=0.01, slip=0.1)
+      >>> bool(slipping.pull > gripping.pull)
+      True
     """
     _check_soil(soil)
     _check("radius", radius, _TINY, np.inf, "give metres")
@@ -183,21 +326,59 @@ def wheel_force(soil: Soil, radius: Scalar, width: Scalar, sinkage: Scalar, slip
 
 
 def bekker_sinkage(soil: Soil, radius: Scalar, width: Scalar, load: Scalar) -> jax.Array:
-    """Sinkage (m) under a load W (N) without shear, small beside D = 2 r: (3 W / (b (3 - n) k sqrt(D)))^(2 / (2 n + 1)) with
-    k = k_c / b + k_phi (Bekker 1956). The factor (3 - n) / 3 is an approximation, exact for n = 1."""
+    """The sinkage of a rigid wheel under a load, without shear.
+
+    z = (3 W / (b (3 - n) k sqrt(D)))^(2 / (2 n + 1)) with k = k_c / b + k_phi and D = 2 r, for z small beside D. The factor
+    (3 - n) / 3 is an approximation, exact for n = 1.
+
+    Args:
+      soil: the soil's strength.
+      radius: r (m).
+      width: b (m).
+      load: W (N).
+
+    Returns:
+      The sinkage z (m). Differentiable.
+
+    Source: Bekker 1956, "Theory of Land Locomotion".
+
+    Example:
+      >>> round(float(js.forces.bekker_sinkage(js.forces.WONG_DRY_SAND, radius=0.048, width=0.05, load=10.0)), 4)
+      0.0103
+    """
     modulus = soil.cohesive_modulus + width * soil.frictional_modulus
     return (3 * jnp.asarray(load) / ((3 - soil.exponent) * modulus * jnp.sqrt(2 * radius))) ** (2 / (2 * soil.exponent + 1))
 
 
 def bekker_resistance(soil: Soil, width: Scalar, sinkage: Scalar) -> jax.Array:
-    """Compaction resistance (N), the work of pressing a metre of rut: b k z^(n+1) / (n + 1) (Bekker 1956)."""
+    """The compaction resistance of a wheel: the work of pressing a rut one metre long.
+
+    R = b k z^(n + 1) / (n + 1) with k = k_c / b + k_phi.
+
+    Args:
+      soil: the soil's strength.
+      width: b (m).
+      sinkage: z (m).
+
+    Returns:
+      R (N). Differentiable.
+
+    Source: Bekker 1956, "Theory of Land Locomotion".
+
+    Example:
+      >>> round(float(js.forces.bekker_resistance(js.forces.WONG_DRY_SAND, width=0.05, sinkage=0.01)), 2)
+      2.33
+    """
     modulus = soil.cohesive_modulus + width * soil.frictional_modulus
     return modulus * jnp.asarray(sinkage) ** (soil.exponent + 1) / (soil.exponent + 1)
 
 
 def _stress(soil: Soil, cut: Cut, angle: jax.Array) -> jax.Array:
-    """F / (w d), Pa. Each side, of area A = d^2 (cot a + cot b) / 2, resists sliding with A (c + K_0 (g d / 3 + q) tan phi):
-    the mean pressure at rest, with K_0 = 1 - sin phi (Jaky 1944). It acts as cohesion on the failure surface does."""
+    """The force on the blade over its width and depth, F / (w d) (Pa).
+
+    Each of the wedge's sides, of area A = d^2 (cot a + cot b) / 2, resists sliding with A (c + K_0 (g d / 3 + q) tan phi):
+    the mean pressure at rest, with K_0 = 1 - sin phi (Jaky 1944). It acts as cohesion on the failure surface does.
+    """
     weight, cohesion, adhesion, surcharge = wedge_factors(soil, cut.rake, angle)
     mean = soil.unit_weight * cut.depth / 3 + cut.surcharge
     shear = soil.cohesion + (1 - jnp.sin(soil.friction)) * mean * jnp.tan(soil.friction)
@@ -213,7 +394,7 @@ def _check_soil(soil: Soil) -> None:
         _check(f"soil.{name}", getattr(soil, name), low, high, "give SI units; for degrees use math.radians(30)")
 
 
-def _check(name: str, value: Any, low: float, high: Any, remedy: str) -> None:
+def _check(name: str, value: Scalar, low: float, high: Scalar, remedy: str) -> None:
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array) and low <= array <= high):
         least = "above" if low else "of at least"

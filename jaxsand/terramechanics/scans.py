@@ -1,7 +1,8 @@
-"""Measured sections: laser scans across a trench in the frame of a reference section. Host side, numpy only.
+"""Measured sections: laser scans across a trench, brought into the frame of a reference section. Host side, numpy only.
 
-A reference gives heights (m) at x (m, an array), 0 beyond its toes. It does not judge what was measured: neighbours tell
-spikes, the level sand tells lift and tilt, so that a wrong reference stays visible.
+A reference is a function that gives heights (m) at x (m, an array), 0 beyond its toes. It is not used to judge the
+measurement: spikes are told by neighbouring points, lift and tilt by the level sand, so that a wrong reference stays
+visible.
 """
 
 import math
@@ -19,7 +20,14 @@ _SMALL = (np.nan, np.nan, 1.196, 1.495, 1.363, 1.206, 1.2, 1.14, 1.129, 1.107)  
 
 @dataclass(frozen=True)
 class Scan:
-    """One pass of the scanner: heights z (m) at x (m, rising), and how many points had none."""
+    """One pass of the scanner.
+
+    Attributes:
+      number: of the scan.
+      x: places across the trench (m), rising.
+      z: heights (m) at x.
+      dropouts: how many points had no height and were left out.
+    """
 
     number: int
     x: np.ndarray
@@ -29,9 +37,15 @@ class Scan:
 
 @dataclass(frozen=True)
 class Measured:
-    """A trench's section: the median z (m) of its aligned scans every `STEP` at x (m), NaN in gaps.
-    spread: one resampled scan's noise (m) there, from the median absolute deviation; NaN for fewer than two scans.
-    rejected: spikes of all `scans`. shift, lift (m), tilt (rad): of each scan, see `align`.
+    """A trench's measured section: the median of its aligned scans.
+
+    Attributes:
+      x: places (m), every `STEP`.
+      z: median height (m) at x, NaN in gaps.
+      spread: the noise (m) of one resampled scan at x, from the median absolute deviation; NaN for fewer than two scans.
+      scans: how many there are.
+      rejected: how many points of all scans were left out as spikes.
+      shift, lift, tilt: the pose of each scan (m, m, rad), see `align`.
     """
 
     x: np.ndarray
@@ -45,9 +59,17 @@ class Measured:
 
 
 def read_scans(path: str | Path) -> dict[tuple[float, float], list[Scan]]:
-    """All scans of a file by (beta_deg, sinkage_mm), rising, also of trenches that nobody asks for.
-    `COLUMNS` in any order, and others; between fields commas, or semicolons or tabs (a comma is then a decimal point).
-    Lines that start with # are comments. Heights that are empty or nan are drop-outs.
+    """Reads all scans of a CSV file.
+
+    The header names the columns: those of `COLUMNS` in any order, and others, which are ignored. Fields are separated by
+    commas, or by semicolons or tabs (a comma is then a decimal point). Lines that start with # are comments. A height that
+    is empty or nan is a drop-out.
+
+    Returns:
+      Lists of scans by trench (beta_deg, sinkage_mm), rising.
+
+    Raises:
+      ValueError: if the file cannot be read; names the line and what is wrong.
     """
     table, scans = _table(path), dict[tuple[float, float], list[Scan]]()
     for beta, sinkage, number in np.unique(table[:, :3], axis=0).tolist():
@@ -77,11 +99,19 @@ def toes(reference: Reference) -> tuple[float, float]:
 
 
 def align(scan: Scan, reference: Reference) -> tuple[Scan, np.ndarray, int]:
-    """The scan in the reference's frame; where that lies in the scanner's: its origin's x and z (m), its tilt (rad); and how
-    many points were left out: spikes, off the median of nine neighbours by 1.5 mm and 4.5 deviations of such differences.
+    """Moves a scan into the frame of a reference section.
 
-    The pose is that of least pseudo-Huber misfit (1 mm), from the best of all shifts 1 mm apart with the reference's middle
-    within the scan. The sand beyond the widened toes weighs 100 times the section, which is left to find the shift.
+    The pose has the least pseudo-Huber misfit (1 mm). The search starts from the best of all shifts 1 mm apart that put the
+    reference's middle within the scan. Sand beyond the toes, widened by `MARGIN`, weighs 100 times the section's, so that it
+    determines lift and tilt, and the section the shift.
+
+    Returns:
+      The scan in the reference's frame; the x and z (m) of the reference's origin in the scanner's frame and the tilt (rad)
+      there, [3]; and how many points were left out as spikes: those off the median of nine neighbours by 1.5 mm and by 4.5
+      standard deviations of such differences.
+
+    Raises:
+      ValueError: if the scan is tilted by more than 10 degrees.
     """
     from scipy.optimize import least_squares
 
@@ -118,8 +148,13 @@ def align(scan: Scan, reference: Reference) -> tuple[Scan, np.ndarray, int]:
 
 
 def resample(x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Heights at the multiples of `STEP` within rising x (m): the points next to each are averaged, x as well as z, and
-    joined by straight lines; NaN within gaps wider than `GAP`."""
+    """Heights at the multiples of `STEP` within rising x (m).
+
+    The points nearest to each multiple are averaged, in x as well as z, and joined by straight lines.
+
+    Returns:
+      The places [n] and the heights [n] (m), NaN within gaps wider than `GAP`.
+    """
     _, sample, count = np.unique(np.round(x / STEP), return_inverse=True, return_counts=True)
     x, z = np.bincount(sample, x) / count, np.bincount(sample, z) / count
     grid = _samples(x[0], x[-1])
@@ -128,7 +163,7 @@ def resample(x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measured_profile(scans: Sequence[Scan], reference: Reference) -> Measured:
-    """The median section of a trench's scans, each aligned with the reference by itself."""
+    """Aligns each of a trench's scans with the reference, and takes the median section."""
     if not scans:
         raise ValueError("measured: got no scans of a trench; give at least one")
     aligned, poses, rejected = zip(*(align(scan, reference) for scan in scans), strict=True)
@@ -146,10 +181,15 @@ def smoothed(z: np.ndarray) -> np.ndarray:
 
 
 def compare(measured: Measured, reference: Reference) -> dict[str, float]:
-    """How far a measured section is from the reference between its toes widened by `MARGIN`: mean and median |difference|
-    and the deepest points' |difference| (m, NaN where not measured), the measured share, and whether it is below 80%.
-    Deepest points are those of both sections `smoothed`, if measured where the reference's is: the rounding of a pointed
-    bottom cancels, the noise's own minimum remains: 0.6 mm of it deepen two scans of a flat floor by 0.3 mm."""
+    """How far a measured section is from the reference, between the reference's toes widened by `MARGIN`.
+
+    The deepest points compared are those of both sections after `smoothed`: this treats the rounding of a pointed bottom
+    alike in both. Noise still lowers the measured minimum: 0.6 mm of it deepen two scans of a flat floor by 0.3 mm.
+
+    Returns:
+      `mean` and `median` of |difference| (m), `depth`, the difference of the deepest points (m; NaN where the section was
+      not measured at the reference's), `covered`, the share that was measured, and `partly`, whether that is below 80%.
+    """
     left, right = toes(reference)
     x = _samples(left - MARGIN, right + MARGIN)
     z, true = np.interp(x, measured.x, measured.z, np.nan, np.nan), reference(x)

@@ -1,19 +1,18 @@
-"""The angle of repose, and a wheel's pass, from sections across its trench; see _least_squares.py. Host side.
+"""Estimates the angle of repose, and a wheel's pass, from sections across its trench; see _least_squares.py. Host side.
 
-The model of a section is a profile of wheel_trench.py laid where the scan was taken: z(x) = lift + tilt x + profile(x -
-shift). Derivatives are central differences.
+The model of a section is a profile of wheel_trench.py, moved to where the scan was taken:
+z(x) = lift + tilt x + profile(x - shift). Derivatives are central differences.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.terramechanics._least_squares import Calibration, Range, as_ranges, check_noise, conclude, spread
+from jaxsand.terramechanics._least_squares import Calibration, Ends, Free, Range, as_ranges, check_noise, conclude, spread
 from jaxsand.terramechanics.wheel_trench import Pass, Profile, relaxing
 
 _SHARED = ("repose_angle", "radius", "width")
@@ -25,8 +24,23 @@ _OFF = 1.0  # m: the misfit where the model has no profile
 
 @dataclass(frozen=True)
 class Section:
-    """Heights `z` (m, NaN where not seen) at places `x` (m) across the trench of a `run`, of which the pass tells what is
-    known and a guess of what is free."""
+    """A measured section across a wheel's trench, for `calibrate_sections`.
+
+    Args:
+      run: the wheel's pass: what is known of it, and a guess of what is free.
+      x: places across the trench [n] (m), 0 at the middle of the cut, positive to the right of the wheel's way; finite.
+      z: heights [n] (m) above the level sand; NaN where not seen.
+
+    Raises:
+      ValueError: if x and z differ in shape, or x is not finite.
+
+    Example:
+      >>> run = js.trench.Pass(slip_angle=0.0, sinkage=0.01)
+      >>> x = np.linspace(-0.1, 0.1, 101)
+      >>> section = js.Section(run, x, js.trench.closed_form(run)(x))
+      >>> section.z.shape
+      (101,)
+    """
 
     run: Pass
     x: np.ndarray
@@ -42,31 +56,48 @@ class Section:
 def calibrate_sections(
     sections: Section | Sequence[Section],
     *,
-    free: Sequence[str] | Mapping[str, tuple[float, float]] = ("repose_angle", "sinkage"),
+    free: Free = ("repose_angle", "sinkage"),
     noise: float | None = None,
     starts: int = 4,
     model: Callable[[Pass], Profile] | None = None,
 ) -> Calibration[tuple[Pass, ...]]:
-    """The sand and the passes with which a model of the wheel's trench best explains sections of it.
+    """Finds the sand and the wheel's passes with which a model of the trench best explains sections across it.
+
+    Minimises sum (lift + tilt x + profile(x - shift) - z)^2 over the seen points of all sections.
 
     Args:
       sections: one or several, of one sand and one wheel.
-      free: fields of `Pass`, and "shift", "lift" (m), "tilt" (rad) of a section; or these with their ranges (low, high).
-        The angle of repose and the wheel's radius and width are shared; others are found for each section, and named
-        sinkage[0], sinkage[1] where there are several. By default 10 to 50 degrees for the angle of repose, 5 mm, 3 mm and
-        0.05 either way for shift, lift and tilt, and a third to three times the guess for others.
-      noise: sigma (m) of white noise in z; by default it is estimated from the residual.
-      starts: how many.
-      model: makes a profile of a pass, or raises ValueError where it has none; by default the exact relaxation on cells of
-        1 mm, `trench.relaxing()`. `trench.closed_form` is a hundred times as fast, and another profile where the wheel is
-        deep in the sand and slips.
+      free: names of fields of `jaxsand.trench.Pass`, and "shift", "lift" (m), "tilt" (rad) of a section; or a mapping of
+        these to their ranges (low, high), which the estimates never leave. The angle of repose and the wheel's radius and
+        width are shared by all sections. Others are found for each section, and are named sinkage[0], sinkage[1] where there
+        are several. By default the range is 10 to 50 degrees for the angle of repose; 5 mm, 3 mm and 0.05 either way for
+        shift, lift and tilt; and a third to three times the guess for others.
+      noise: standard deviation (m) of the white noise in z; None estimates it from the residual.
+      starts: how many searches are made; those after the first begin at places spread over the ranges.
+      model: makes a profile of a pass, or raises ValueError where there is none. None stands for the exact relaxation on
+        cells of 1 mm, `jaxsand.trench.relaxing()`. `jaxsand.trench.closed_form` is a hundred times as fast, but gives
+        another profile where the wheel is deep in the sand and slips.
 
-    The standard errors hold white noise in z and, of the exact relaxation, the error of its cells, found from cells of half
-    the size. A `model` that you give is taken to have no grid. What the model leaves out of a trench is not in the errors.
-    Next to where a model has no profile they are worth nothing, and the verdict says UNCLEAN.
+    Returns:
+      A `Calibration`: `values` and their standard `errors` by name, the `verdict`, and the passes with the values put in as
+      `model`. The errors hold white noise in z and, for the exact relaxation, the error of its cells, found from cells of
+      half the size; a `model` that you give is taken to have no grid. They do not hold what the model leaves out of a
+      trench. Next to where a model has no profile they are worth nothing, and the verdict says UNCLEAN. A bad fit raises
+      nothing.
 
     Raises:
-      ValueError: names the field, the value and the remedy; a bad fit raises nothing, its `verdict` says so.
+      ValueError: names the argument, its value and the remedy.
+
+    Source: Levenberg 1944; Marquardt 1963, doi:10.1137/0111030.
+
+    Example:
+      >>> run = js.trench.Pass(slip_angle=math.radians(45), sinkage=0.015)
+      >>> guess = js.trench.Pass(slip_angle=math.radians(45), sinkage=0.012)
+      >>> x = np.linspace(-0.1, 0.1, 101)
+      >>> section = js.Section(guess, x, js.trench.closed_form(run)(x))
+      >>> found = js.calibrate_sections(section, free=["sinkage"], starts=1, noise=1e-4, model=js.trench.closed_form)
+      >>> round(found.values["sinkage"], 6)
+      0.015
     """
     some = [sections] if isinstance(sections, Section) else list(sections)
     if not some:
@@ -107,30 +138,26 @@ def calibrate_sections(
     def passes(values: np.ndarray) -> tuple[Pass, ...]:
         return tuple(_placed(section.run, k, keys, values)[0] for k, section in enumerate(some))
 
-    return conclude(
-        ranges,
-        np.array([end.x - 1 for end in ends]),
-        np.array([2 * end.cost for end in ends]),
-        np.array([end.jac for end in ends]),
-        np.array([np.abs(end.jac).max() < 1 for end in ends]),  # m to a range: else the model ends next to the estimate
-        np.array([end.status > 0 for end in ends]),
-        count,
-        noise,
-        calls,
-        passes,
-        reference,
+    found = Ends(
+        x=np.array([end.x - 1 for end in ends]),
+        cost=np.array([2 * end.cost for end in ends]),
+        jacobian=np.array([end.jac for end in ends]),
+        clean=np.array([np.abs(end.jac).max() < 1 for end in ends]),  # m to a range: else the model ends next to it
+        done=np.array([end.status > 0 for end in ends]),
+        looks=np.array([end.nfev for end in ends]),
     )
+    return conclude(ranges, found, count, noise, calls, passes, reference)
 
 
 def _placed(run: Pass, k: int, keys: list[tuple[str, int]], values: np.ndarray) -> tuple[Pass, dict[str, float]]:
-    """The pass of section k with these values, and where the section lies."""
+    """Section k's pass with the given values put in, and its shift, lift and tilt."""
     own = {name: float(value) for (name, of), value in zip(keys, values, strict=True) if of in (-1, k)}
     place = {name: own.pop(name, 0.0) for name in _PLACE}
     return replace(run, **own), place
 
 
-def _ranges(sections: list[Section], free: Any) -> tuple[list[Range], list[tuple[str, int]]]:
-    """A range for every parameter, and its name and section (-1: all of them)."""
+def _ranges(sections: list[Section], free: Free) -> tuple[list[Range], list[tuple[str, int]]]:
+    """A range for every parameter, and its name and section (-1 where all sections share it)."""
     known = [field.name for field in fields(Pass)]
     asked = as_ranges(free)
     if unknown := set(asked) - {*known, *_PLACE}:

@@ -1,7 +1,7 @@
-"""The wheel's ruts: trenches simulated over slip angles and sinkages, beside what is known of them.
+"""The wheel's trenches: simulated over slip angles and sinkages, and compared with what is known of them.
 
-The experiment of arXiv:1908.02745, section IV: a wheel is towed across level sand, and the section it leaves half-way is
-compared with the closed form and with the exact relaxation (wheel_trench.py), and with a user's scans (scans.py).
+The experiment of arXiv:1908.02745, section IV: a wheel is towed across level sand, and the section of its trench half-way is
+compared with the closed form, with the exact relaxation (wheel_trench.py), and with a user's scans (scans.py).
 """
 
 import math
@@ -47,7 +47,13 @@ _APART = 0.05  # m between the sections that tell how steady the trench is
 
 @dataclass(frozen=True)
 class Rut:
-    """The section that a wheel left half-way, the mean distance (m) of that from the section 5 cm earlier, and the cost."""
+    """The trench of one simulated pass.
+
+    Attributes:
+      profile: the section half-way.
+      unsteady: the mean distance (m) between that section and the one 5 cm before it.
+      seconds: how long the simulation took.
+    """
 
     profile: Profile
     unsteady: float
@@ -57,8 +63,11 @@ class Rut:
 def simulate(trench: Trench, spacing: float, push: Push) -> Rut:
     """Tows the paper's wheel one metre over level sand on cells of `spacing` (m), and takes the section half-way.
 
-    Its way runs along the middle of a row of cells. The sand is computed in a window that follows the wheel, and settles
-    everywhere at the end. Raises OutcomeError if it does not come to rest.
+    The wheel runs along the middle of a row of cells. The sand is computed in a window that follows the wheel, and settles
+    everywhere at the end.
+
+    Raises:
+      OutcomeError: if the sand does not come to rest.
     """
     shape = round(_WIDE / spacing) // 2 * 2 + 1, round((_BEFORE + _LENGTH + _AFTER) / spacing)
     window = Window((shape[0], min(round(_AROUND / spacing), shape[1])), math.inf)
@@ -81,7 +90,7 @@ def simulate(trench: Trench, spacing: float, push: Push) -> Rut:
 
 
 def simulate_all(trenches: Iterable[Trench], spacing: float, push: Push, tell: Tell = quiet) -> dict[Trench, Rut]:
-    """`simulate` for many trenches, on all cores."""
+    """Calls `simulate` for every trench, on all cores."""
     trenches = list(trenches)
 
     def one(trench: Trench) -> Rut:
@@ -94,7 +103,7 @@ def simulate_all(trenches: Iterable[Trench], spacing: float, push: Push, tell: T
 
 
 def distances(profile: Profile, reference: Profile) -> np.ndarray:
-    """How far apart (mm), every 0.5 mm between the reference's outer toes widened by 10 mm."""
+    """The distances (mm) between two profiles every 0.5 mm, between the reference's toes widened by 10 mm."""
     x = np.arange(reference.toes[0] - 0.01, reference.toes[1] + 0.01, 5e-4)
     return np.abs(profile(x) - reference(x)) * 1e3
 
@@ -119,7 +128,11 @@ def references(trenches: Iterable[Trench]) -> dict[str, dict[Trench, Profile]]:
 def compare_with_scans(
     ruts: dict[Trench, Rut], scans: dict[Trench, list[Scan]]
 ) -> tuple[list[dict[str, Any]], dict[Trench, Profile]]:
-    """A row for every trench that was scanned, and the measured sections, laid on the simulated ones."""
+    """Compares simulated trenches with scans of them.
+
+    Returns:
+      A row of figures for every trench that was scanned, and the measured sections in the frame of the simulated ones.
+    """
     rows, sections = [], {}
     for trench, some in scans.items():
         profile = ruts[trench].profile
@@ -135,7 +148,7 @@ def compare_with_scans(
 
 
 def check_scans(scans: dict[Trench, list[Scan]]) -> None:
-    """Raises ValueError where the experiment cannot make a scanned trench."""
+    """Raises ValueError for scans of a trench that the experiment cannot simulate."""
     for beta, sinkage in scans:
         if not (0 <= beta <= 90 and 1 <= sinkage <= 30):
             raise ValueError(
@@ -150,10 +163,19 @@ def experiment(
     scans: dict[Trench, list[Scan]] | None = None,
     tell: Tell = quiet,
 ) -> tuple[dict[str, Any], dict[str, dict[Trench, Profile]]]:
-    """The table of all fifteen trenches, and the profiles by their source (a rule or a reference).
+    """Simulates all fifteen trenches with each rule, and compares them.
 
-    Scans are laid on the sections of each rule: `measured` on those of the first, `measured-split` on those of a second. The
-    table holds `rows`, and in `summary`, `by_beta_deg` and `by_sinkage_mm` their means.
+    Args:
+      spacing: of the cells (m).
+      rules: names from `RULES`.
+      scans: measured scans by trench, if any.
+      tell: is called with a line of progress.
+
+    Returns:
+      The table: `rows`, and their means in `summary`, `by_beta_deg` and `by_sinkage_mm`; and the profiles by their source,
+        which
+      is a rule or a reference. Scans are aligned with the sections of each rule: `measured` has those aligned with the first
+      rule's, `measured-split` those aligned with a second one's.
     """
     known = references(TRENCHES)
     profiles: dict[str, dict[Trench, Profile]] = dict(known)
@@ -194,7 +216,7 @@ def _named(trench: Trench) -> dict[str, float]:
 
 
 def _means(rows: list[dict[str, Any]], **of: float) -> dict[str, dict[str, dict[str, float]]]:
-    """{rule: {reference: figures}}, averaged over the trenches."""
+    """The figures averaged over the rows that have the given values: {rule: {reference: figures}}."""
     some = [row for row in rows if all(row[key] == value for key, value in of.items())]
     table: dict[str, dict[str, dict[str, float]]] = {}
     for rule, reference in dict.fromkeys((row["rule"], row["reference"]) for row in some):

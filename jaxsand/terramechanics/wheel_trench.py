@@ -1,24 +1,26 @@
 """The trench of a towed wheel in closed form, and its exact relaxation.
 
 Pavlov & Johnson, Soil Displacement Terramechanics for Wheel-Based Trenching with a Planetary Rover (ICRA 2019). A wheel of
-radius r and width b is dragged at sinkage h, its plane at the slip angle beta to its way. With t = tan(angle of repose),
-s = sqrt(2 r h - h^2) half its chord in the sand and p = b cos(beta), it sweeps a cut w = p + 2 s sin(beta) wide: a floor of
-width p at depth h between two flanks (w - p) / 2 wide, parabolas of area A = (w - p) h / 3 each.
+radius r and width b is dragged at sinkage h, with the slip angle beta between its plane and its direction of travel. Let
+t = tan(angle of repose), s = sqrt(2 r h - h^2) half the wheel's chord in the sand, and p = b cos(beta). The wheel sweeps a
+cut w = p + 2 s sin(beta) wide: a floor of width p at depth h between two flanks, each (w - p) / 2 wide, a parabola, and of
+area A = (w - p) h / 3.
 
-Before the sand flows, what was in the cut stands beside it in two right triangles, steep against the cut: alike, or, when
-the wheel's flank takes more than its rim (2 A > h p) and beta is 10 degrees and more from 0 and from 90, 2 A on the left and
-h p on the right. The piles jump with beta where the 10 degrees decide, not at 2 A = h p, where the two rules agree. After
-the sand has flowed, all faces lie at repose, the outer toes stay where they were, and the sand of the left and of the right
-pile part where the rim's cut ends; below 10 degrees in the middle, so that pointed profiles jump there.
+Before the sand flows, the sand from the cut stands beside it in two right triangles, steep against the cut. They are equal,
+unless the flanks hold more than the floor (2 A > h p) and beta is at least 10 degrees from 0 and from 90: then the left one
+holds 2 A and the right one h p. Where beta passes these 10 degrees the piles jump; where 2 A passes h p the two rules agree.
+After the sand has flowed, all faces lie at repose and the outer toes stay where they were. The sand of the left and of the
+right pile meets at the end of the floor, x = p / 2; for beta below 10 degrees it meets in the middle, so that pointed
+profiles jump there.
 
-Heights and places are in metres, x to the right across the way, 0 at the middle of the cut; angles are in radians.
+Heights and places are in metres, x to the right across the direction of travel, 0 at the middle of the cut; angles are in
+radians.
 """
 
 import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,11 +37,29 @@ _TEN = math.radians(10)
 
 @dataclass(frozen=True)
 class Pass:
-    """A wheel's pass: slip angle beta (0 to pi/2), sinkage, wheel and sand. Lengths in m, angles in rad.
+    """One pass of a wheel through level sand.
 
-    `spin` is the rim's speed over the wheel's, r omega / v: 0 for a wheel that is towed without turning, 1 / (1 - i) for one
-    driven at the slip ratio i. Its grousers, `grouser_height` high, of which sand fills the share `grouser_fill`, take
-    spin b h_g zeta of the section along and leave it behind the wheel.
+    Args:
+      slip_angle: beta, between the wheel's plane and its direction of travel (rad), 0 to pi/2.
+      sinkage: depth of the wheel's lowest point below the level sand (m), 0 to the radius.
+      radius: of the wheel (m).
+      width: of the wheel (m).
+      repose_angle: of the sand (rad).
+      spin: the rim's speed over the wheel's, r omega / v: 0 for a wheel towed without turning, 1 / (1 - i) for one driven at
+        the slip ratio i. A spinning wheel's grousers carry spin b h_g zeta of the section along and leave it behind the
+        wheel.
+      grouser_height: h_g (m).
+      grouser_fill: zeta, the share of a grouser's height that sand fills.
+
+    Raises:
+      ValueError: for a value out of range.
+
+    Source: Pavlov & Johnson, ICRA 2019.
+
+    Example:
+      >>> run = js.trench.Pass(slip_angle=0.0, sinkage=0.01)
+      >>> run.swept == run.width
+      True
     """
 
     slip_angle: float
@@ -63,11 +83,12 @@ class Pass:
 
     @property
     def slope(self) -> float:
+        """The tangent of the angle of repose."""
         return math.tan(self.repose_angle)
 
     @property
     def rim(self) -> float:
-        """The width p of the rim's cut (m)."""
+        """The width p of the cut's floor, which the wheel's rim cuts (m)."""
         return self.width * math.cos(self.slip_angle)
 
     @property
@@ -82,25 +103,28 @@ class Pass:
 
     @property
     def carried(self) -> float:
-        """The area (m^2) that the grousers leave behind the wheel, as far as there is a pile to take it from."""
+        """The area (m^2) of the section that the grousers leave behind the wheel, at most what the pile that it comes from
+        holds.
+        """
         asked = self.spin * self.width * self.grouser_height * self.grouser_fill
         left, right = self._displaced()
         return min(asked, right if self.parted else left + right)
 
     @property
     def parted(self) -> bool:
-        """Whether the flank's sand goes to one side and the rim's to the other."""
+        """Whether the flanks' sand goes to the left and the floor's to the right."""
         beta, flanks = self.slip_angle, 2 * self._flank_area()
         return not (beta < _TEN or abs(beta - math.pi / 2) < _TEN or flanks <= self.sinkage * self.rim)
 
     def piles(self) -> tuple[float, float]:
-        """The areas (m^2) of the left and the right pile before the sand flows; grousers take from what the rim pushes."""
+        """The areas (m^2) of the left and the right pile before the sand flows, less what the grousers take."""
         left, right = self._displaced()
         if self.parted:
             return left, right - self.carried
         return left - self.carried / 2, right - self.carried / 2
 
     def _displaced(self) -> tuple[float, float]:
+        """The areas (m^2) of the left and the right pile without grousers."""
         flanks, rim = 2 * self._flank_area(), self.sinkage * self.rim
         return (flanks, rim) if self.parted else ((flanks + rim) / 2, (flanks + rim) / 2)
 
@@ -108,7 +132,7 @@ class Pass:
         return 2 / 3 * self.flank * self.sinkage
 
     def floor(self) -> float:
-        """The depth of the cut's floor (m) when what the grousers leave behind lies level in it."""
+        """The depth of the cut's floor (m) once the sand left by the grousers lies level in it."""
         filled = self.carried
         if filled == 0:
             return self.sinkage
@@ -123,7 +147,21 @@ class Pass:
 
 @dataclass(frozen=True)
 class Profile:
-    """A section: heights `z` at places `x` (m, rising), straight between them, level sand at 0 beyond."""
+    """A section across a trench: a chain of straight lines, level sand at height 0 on both sides.
+
+    Calling a profile with places x (m) gives the heights there (m).
+
+    Args:
+      x: places [n] (m), rising.
+      z: heights [n] (m) at x.
+
+    Example:
+      >>> profile = js.trench.Profile(np.array([-1.0, 0.0, 1.0]), np.array([0.0, -0.5, 0.0]))
+      >>> profile.deepest, profile.area()
+      (0.5, -0.5)
+      >>> profile(np.array([0.5, 3.0])).tolist()
+      [-0.25, 0.0]
+    """
 
     x: np.ndarray
     z: np.ndarray
@@ -133,37 +171,53 @@ class Profile:
 
     @property
     def toes(self) -> tuple[float, float]:
-        """Where the profile leaves the level sand."""
+        """The first and the last place (m), where the profile meets the level sand."""
         return float(self.x[0]), float(self.x[-1])
 
     @property
     def deepest(self) -> float:
-        """How deep the deepest point lies below the level sand."""
+        """The depth of the deepest point below the level sand (m)."""
         return -float(self.z.min())
 
     @property
     def peaks(self) -> tuple[float, float]:
-        """The highest points left and right of the deepest."""
+        """The heights of the highest points left and right of the deepest (m)."""
         low = int(self.z.argmin())
         return float(self.z[: low + 1].max()), float(self.z[low:].max())
 
     def area(self) -> float:
-        """What lies above level less what is missing below it (m^2)."""
+        """The area above level less the missing area below it (m^2)."""
         return float(np.trapezoid(self.z, self.x))
 
 
 def closed_form(run: Pass) -> Profile:
-    """The settled section, all faces at repose: toe, peak, foot, foot, peak, toe.
+    """The settled section of a wheel's trench in closed form, all faces at repose: toe, peak, foot, foot, peak, toe.
 
-    Pointed while that is no deeper than the cut's floor: with u = h_L1 + (w + p) t / 2 and v = h_R1 + (w - p) t / 2, h_1 the
-    piles' heights before the flow, its depth d solves -2 d^2 - 2 (u + v) d + u^2 + v^2 = 0 and the peaks are (u - d) / 2 and
-    (v - d) / 2; for beta < 10 degrees the deepest point lies in the middle. Else flat, at the depth of the cut's floor, and
-    each peak x solves x^2 + 2 h x + h^2 / 2 - h h_1 - h_1^2 / 2 - (w - p) h t / 6 = 0. With grousers the same balance is
-    drawn up for a cut filled level to the depth of `Pass.floor`.
+    The section is pointed while that makes it no deeper than the cut's floor. With u = h_L1 + (w + p) t / 2 and v = h_R1 +
+    (w - p) t / 2, h_1 the piles' heights before the flow, its depth d then solves -2 d^2 - 2 (u + v) d + u^2 + v^2 = 0, and
+    the peaks are (u - d) / 2 and (v - d) / 2; for beta < 10 degrees the deepest point lies in the middle. Otherwise the
+    section is flat at the depth h of the cut's floor, and each peak x solves x^2 + 2 h x + h^2 / 2 - h h_1 - h_1^2 / 2 - (w
+    - p) h t / 6 = 0. With grousers the same balance holds for a cut that is filled level to the depth of `Pass.floor`.
+
+    Args:
+      run: the wheel's pass.
+
+    Returns:
+      The settled `Profile`; its area is 0 without grousers.
 
     Raises:
-      ValueError: where the closed form breaks down: a pile would end below the level sand, or a floor be narrower than
-        nothing (where pointed and flat profiles meet; of the source's wheel and sand 2% of all slip angles and sinkages).
+      ValueError: where the closed form breaks down: a pile would end below the level sand, or the floor would have a
+        negative width (where pointed and flat profiles meet; for the source's wheel and sand 2% of all slip angles and
+        sinkages).
+
+    Source: Pavlov & Johnson, ICRA 2019; see the head of this module for the symbols.
+
+    Example:
+      >>> profile = js.trench.closed_form(js.trench.Pass(slip_angle=math.radians(45), sinkage=0.015))
+      >>> round(profile.deepest, 4)
+      0.015
+      >>> abs(profile.area()) < 1e-12
+      True
     """
     t, w, p = run.slope, run.swept, run.rim
     left, right = (math.sqrt(2 * t * area) for area in run.piles())
@@ -187,7 +241,7 @@ def closed_form(run: Pass) -> Profile:
 
 
 def _beside_a_floor(run: Pass, depth: float, pile: float) -> float:
-    """The height of the peak beside a flat floor: what the pile and the flank hold keeps its area."""
+    """The height (m) of the peak beside a flat floor, such that the area of the pile and of the flank is kept."""
     inside = _inside(run, depth)
     cut = run.flank * run.sinkage * ((1 - inside) - (1 - inside**3) / 3)
     spare = run.slope * (depth * run.flank * (1 - inside) - cut)
@@ -200,20 +254,51 @@ def _inside(run: Pass, depth: float) -> float:
 
 
 def unsettled(run: Pass) -> Profile:
-    """The section before the sand flows: the cut, and a pile on each side, steep against it. Faces of no width are kept."""
+    """The section before the sand flows: the cut, and a pile on each side, steep against it.
+
+    Args:
+      run: the wheel's pass.
+
+    Returns:
+      A `Profile`; where it jumps, two points have the same x.
+
+    Example:
+      >>> profile = js.trench.unsettled(js.trench.Pass(slip_angle=0.0, sinkage=0.01))
+      >>> round(profile.deepest, 4)
+      0.01
+    """
     t, w = run.slope, run.swept
     left, right = (math.sqrt(2 * t * area) for area in run.piles())
     eta = np.linspace(1, _inside(run, run.floor()), 201)
     # The chords of a parabola lie above it; lowered by as much, they hold its area.
     flank = -run.sinkage * (1 - eta**2 + (eta[1] - eta[0]) ** 2 / 6)
     out = run.rim / 2 + run.flank * eta
-    x: list[Any] = [[-w / 2 - left / t, -w / 2], -out, [-out[-1], out[-1]], out[::-1], [w / 2, w / 2 + right / t]]
-    z: list[Any] = [[0, left], flank, [-run.floor(), -run.floor()], flank[::-1], [right, 0]]
+    x: list[np.ndarray | list[float]] = [
+        [-w / 2 - left / t, -w / 2],
+        -out,
+        [-out[-1], out[-1]],
+        out[::-1],
+        [w / 2, w / 2 + right / t],
+    ]
+    z: list[np.ndarray | list[float]] = [[0, left], flank, [-run.floor(), -run.floor()], flank[::-1], [right, 0]]
     return Profile(np.concatenate(x), np.concatenate(z))
 
 
 def cell_means(profile: Profile, edges: np.ndarray) -> np.ndarray:
-    """The mean height of a profile, jumps and all, between neighbouring `edges`."""
+    """The mean heights of a profile in cells, exact also where it jumps.
+
+    Args:
+      profile: the section.
+      edges: the cells' edges [n + 1] (m), rising.
+
+    Returns:
+      The mean heights [n] (m).
+
+    Example:
+      >>> profile = js.trench.Profile(np.array([-1.0, 0.0, 1.0]), np.array([0.0, -0.5, 0.0]))
+      >>> js.trench.cell_means(profile, np.array([-1.0, 0.0, 1.0])).tolist()
+      [-0.25, -0.25]
+    """
     x, z = profile.x, profile.z
     whole = np.concatenate([[0], np.cumsum(np.diff(x) * (z[1:] + z[:-1]) / 2)])
     k = np.clip(np.searchsorted(x, edges, side="right") - 1, 0, len(x) - 2)
@@ -224,9 +309,26 @@ def cell_means(profile: Profile, edges: np.ndarray) -> np.ndarray:
 
 
 def relaxed(runs: list[Pass], spacing: float = 5e-4) -> list[Profile]:
-    """What sand in one dimension makes of the unsettled sections (all of one angle of repose), in the limit of small steps.
+    """The settled sections of wheel's passes, found by letting the unsettled sections relax in one dimension.
 
-    Computed in float64 on cells of `spacing` (m), which is where the error is: about mu spacing / 2 at a corner.
+    This is the limit of small steps of the simulator's own settling. It is computed in float64, and its error comes from the
+    cells: about tan(angle of repose) spacing / 2 at a corner.
+
+    Args:
+      runs: passes in sand of one angle of repose, at least one.
+      spacing: of the cells (m).
+
+    Returns:
+      A `Profile` for every pass.
+
+    Raises:
+      ValueError: for no passes, or passes of different angles of repose.
+
+    Example:
+      >>> run = js.trench.Pass(slip_angle=0.0, sinkage=0.01)
+      >>> exact = js.trench.relaxed([run], spacing=4e-3)[0]
+      >>> abs(exact.deepest - js.trench.closed_form(run).deepest) < 2e-3
+      True
     """
     if len({run.repose_angle for run in runs}) != 1:
         angles = sorted({run.repose_angle for run in runs})
@@ -236,7 +338,21 @@ def relaxed(runs: list[Pass], spacing: float = 5e-4) -> list[Profile]:
 
 
 def relaxing(reach: float = 0.2, spacing: float = 1e-3) -> Callable[[Pass], Profile]:
-    """`relaxed` for one pass after the other, on cells of `spacing` (m) as far as `reach` (m) to either side."""
+    """A function like `relaxed` for one pass at a time, on the same cells for all passes.
+
+    Args:
+      reach: how far the cells go to either side (m).
+      spacing: of the cells (m).
+
+    Returns:
+      A function from a `Pass` to its settled `Profile`; it raises ValueError for a pass whose piles come within ten cells of
+      the reach.
+
+    Example:
+      >>> relax = js.trench.relaxing(reach=0.1, spacing=4e-3)
+      >>> relax(js.trench.Pass(slip_angle=0.0, sinkage=0.01)).deepest > 0
+      True
+    """
 
     def relax(run: Pass) -> Profile:
         if max(map(abs, unsettled(run).toes)) > reach - 10 * spacing:
@@ -260,7 +376,20 @@ def _relaxed(runs: list[Pass], reach: float, spacing: float) -> list[Profile]:
 
 
 def trimmed(profile: Profile, least: float) -> Profile:
-    """The profile from toe to toe, where it is more than `least` (m) off level."""
+    """The part of a profile between its toes.
+
+    Args:
+      profile: the section.
+      least: heights (m) nearer to 0 count as level.
+
+    Returns:
+      The profile from the last level point before the trench to the first one after it.
+
+    Example:
+      >>> wide = js.trench.Profile(np.arange(5.0), np.array([0.0, 0.0, -1.0, 0.0, 0.0]))
+      >>> js.trench.trimmed(wide, 1e-6).x.tolist()
+      [1.0, 2.0, 3.0]
+    """
     x, z = profile.x, profile.z
     moved = np.flatnonzero(np.abs(z) > least)
     if not moved.size:

@@ -1,1 +1,1 @@
-"""The only place that draws."""
+"""Figures and animations, by matplotlib and Pillow."""

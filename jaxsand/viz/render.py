@@ -1,4 +1,4 @@
-"""Pictures: maps beside their goal, and the sand being pushed. The only file that draws."""
+"""Pictures of maps beside their goal, of plans and benchmarks, and animations of the sand being pushed."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsand.planning.binary import Plan
-from jaxsand.planning.pipeline import ShapeResult
+from jaxsand.planning.pipeline import ShapeResult, Target
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,7 +47,7 @@ def shape_figure(result: ShapeResult) -> "Figure":
 
 
 def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
-    """Error against run time of every scheme on every scene (rows) and grid (columns); a curve runs over tolerances."""
+    """Error against run time of every scheme, by scene (rows) and grid (columns); a curve runs over tolerances."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FixedLocator
 
@@ -74,8 +74,10 @@ def work_precision_figure(rows: list[dict[str, Any]]) -> "Figure":
 
 
 def plan_figure(dig: np.ndarray, plan: Plan) -> "Figure":
-    """A map's cells and the path over them, coloured by its order and drawn to the right of where it goes, so that the way
-    there and the way back lie apart."""
+    """The cells of a binary map and the path over them, coloured by its order.
+
+    The path is drawn to the right of its direction, so that the way there and the way back lie apart.
+    """
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -113,7 +115,7 @@ def plan_figure(dig: np.ndarray, plan: Plan) -> "Figure":
 
 
 def complexity_figure(report: dict[str, Any]) -> "Figure":
-    """Expansions and time of planning against back-tracks and size, and the paper's search at falling alpha."""
+    """States expanded and time of planning against back-tracks and map size, of three engines."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 7), layout="constrained")
@@ -135,7 +137,7 @@ def complexity_figure(report: dict[str, Any]) -> "Figure":
 
 
 def alpha_figure(report: dict[str, Any]) -> "Figure":
-    """Nodes that the paper's search opens at falling alpha, and the steps in excess of the fewest."""
+    """Nodes that the paper's search opens, and its steps in excess of the fewest, against alpha."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 3.4), layout="constrained")
@@ -152,7 +154,7 @@ def alpha_figure(report: dict[str, Any]) -> "Figure":
 
 
 def save_figure(draw: "Callable[[], Figure]", path: Path) -> None:
-    """Draws a figure and writes it as PNG, by matplotlib's own defaults whatever the user's settings ask for."""
+    """Draws a figure and writes it as PNG, with matplotlib's defaults whatever the user's settings are."""
     import matplotlib.style
 
     with matplotlib.style.context("default"):
@@ -188,7 +190,10 @@ def save_animation(result: ShapeResult, path: Path, width: int = 420, millisecon
 
 
 def lit(height: np.ndarray, spacing: float) -> np.ndarray:
-    """A map as sand in slanting light, RGBA [H, W, 4]: Lambert's law for a lamp 40 degrees up in the north-west."""
+    """A map [H, W] (m) as sand in slanting light, RGBA [H, W, 4].
+
+    The brightness follows Lambert's law for a lamp 40 degrees up in the north-west.
+    """
     from matplotlib.colors import LinearSegmentedColormap
 
     rows, columns = height.shape
@@ -202,7 +207,8 @@ def lit(height: np.ndarray, spacing: float) -> np.ndarray:
     return shade
 
 
-def _map(axes: "Axes", values: np.ndarray, target: Any, title: str, colours: str, top: float, label: str) -> None:
+def _map(axes: "Axes", values: np.ndarray, target: Target, title: str, colours: str, top: float, label: str) -> None:
+    """Draws a map with its colour bar."""
     image = axes.imshow(values, origin="lower", extent=_extent(target), cmap=colours, vmin=-top, vmax=top)
     axes.set_title(title, loc="left")
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
@@ -211,6 +217,7 @@ def _map(axes: "Axes", values: np.ndarray, target: Any, title: str, colours: str
 
 
 def _path(axes: "Axes", result: ShapeResult) -> None:
+    """Draws the tool's paths with arrows."""
     size = 6 if len(result.target.paths) < 10 else 3
     for number, path in enumerate(result.target.paths):
         axes.plot(*path.T, "-", color="black", lw=1.2, alpha=0.7)
@@ -224,21 +231,25 @@ def _path(axes: "Axes", result: ShapeResult) -> None:
 
 
 def _unit(runs: np.ndarray) -> np.ndarray:
+    """Vectors [n, 2] of length 1; NaN where there is no direction."""
     length = np.hypot(*runs.T)[:, None]
     return np.where(length > 0, runs / np.where(length > 0, length, 1), np.nan)
 
 
 def _outline(result: ShapeResult, tool: np.ndarray) -> np.ndarray:
+    """The corners [4, 2] = x, y (m) of the tool at a pose x, y, cos, sin."""
     x, y, cos, sin = tool
     corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) / 2 * result.target.footprint
     return np.stack([x + corners @ [cos, -sin], y + corners @ [sin, cos]], 1)
 
 
-def _extent(target: Any) -> tuple[float, float, float, float]:
+def _extent(target: Target) -> tuple[float, float, float, float]:
+    """The map's left, right, lower and upper edge (m)."""
     rows, columns = target.scene.grid.shape
     dx = float(target.scene.grid.spacing)
     return (0, columns * dx, 0, rows * dx)
 
 
 def _span(*maps: np.ndarray) -> float:
+    """The largest height of some maps."""
     return max(1e-6, *(float(np.abs(m).max()) for m in maps))

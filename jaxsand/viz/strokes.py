@@ -1,4 +1,4 @@
-"""Pictures of searches for strokes; matplotlib only."""
+"""Figures of searches for strokes, by matplotlib."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def strokes_figure(rows: list[dict[str, Any]], reached: float) -> "Figure":
-    """Against the simulator's calls: how many runs have the IoU `reached`, and the l2 reduction (median, quartiles)."""
+    """How many runs reach an IoU of `reached`, and the l2 reduction (median, quartiles), against the simulator's calls."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4), layout="constrained")
@@ -34,7 +34,10 @@ def strokes_figure(rows: list[dict[str, Any]], reached: float) -> "Figure":
 
 
 def found_figure(shown: list[tuple[str, float, np.ndarray, np.ndarray]], columns: int = 13) -> "Figure":
-    """Goals, and below each what strokes made of it, as heights (mm) over the sand before: (name, IoU, goal, found)."""
+    """Goals, and below each what strokes made of it, as heights (mm) over the sand before.
+
+    `shown` lists the name, the IoU, the goal and the result [H, W] (m) of each.
+    """
     from matplotlib.figure import Figure
 
     columns = min(columns, len(shown))
@@ -53,7 +56,7 @@ def found_figure(shown: list[tuple[str, float, np.ndarray, np.ndarray]], columns
 
 
 def _held(curve: list[list[float]], calls: np.ndarray, most: int) -> np.ndarray:
-    """The best figure after so many calls; none before the first, nor beyond the budget."""
+    """The best figure after each number of calls; NaN before the first call and beyond the budget."""
     known, figures = np.array(curve).T
     at = np.searchsorted(known, calls, side="right") - 1
     return np.where((at >= 0) & (calls <= most), figures[np.maximum(at, 0)], np.nan)

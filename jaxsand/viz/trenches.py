@@ -1,4 +1,4 @@
-"""Pictures of the wheel's trenches; matplotlib only."""
+"""Figures of the wheel's trenches, by matplotlib."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +8,7 @@ from jaxsand.terramechanics.trench_experiment import ANGLES, SINKAGES, Trench, d
 from jaxsand.terramechanics.wheel_trench import Profile
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.figure import Figure
 
 _LOOKS: dict[str, dict[str, Any]] = {
@@ -88,8 +89,9 @@ def spacing_figure(rows: list[dict[str, Any]]) -> "Figure":
     return figure
 
 
-def _labels(axes: Any) -> tuple[list[Any], list[str]]:
-    found: dict[str, Any] = {}
+def _labels(axes: np.ndarray) -> tuple[list["Artist"], list[str]]:
+    """Each label in the axes once, with its line."""
+    found: dict[str, Artist] = {}
     for ax in axes.ravel():
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)

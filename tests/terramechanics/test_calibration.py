@@ -218,13 +218,10 @@ def test_a_wrong_model_is_said():
 def fitted(residuals, ranges, starts=6, count=50, sigma=None, clean=True):
     """The climb and its conclusion on residuals of x in units of the ranges."""
     begin, given = jnp.asarray(spread(ranges, starts)), jnp.asarray(math.nan if sigma is None else sigma)
-    found = jax.jit(lambda x: climb(lambda x: (residuals(x), jnp.asarray(clean)), x, count, jnp.asarray(count), given))(
-        begin
-    )
-    *ends, looks = (np.asarray(part) for part in found)
+    ends = jax.jit(lambda x: climb(lambda x: (residuals(x), jnp.asarray(clean)), x, count, jnp.asarray(count), given))(begin)
     own = jax.jit(residuals)
     return conclude(
-        ranges, *ends, count, sigma, int(looks.sum()), lambda values: values, lambda x: (own(x), 0 * own(x), True)
+        ranges, ends, count, sigma, int(ends.looks.sum()), lambda values: values, lambda x: (own(x), 0 * own(x), True)
     )
 
 

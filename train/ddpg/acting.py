@@ -1,4 +1,4 @@
-"""How an actor and its critic act: by themselves, or proposing strokes to whoever looks ahead with the simulator."""
+"""How an actor and its critic act: alone, or as a policy that proposes strokes to a look-ahead with the simulator."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -7,11 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from jaxsand.bench.stroke_goals import CELLS
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.scene.scene import Scene, blade_of
-from train.ddpg.networks import Actor, Critic
+from train.ddpg.networks import Actor, Critic, Observation
 
 _TRIED = 16  # actions for each one that is asked for
 _SEED = 0  # of how they differ from the actor's, the same at every look
@@ -19,25 +20,38 @@ _SEED = 0  # of how they differ from the actor's, the same at every look
 
 @dataclass(frozen=True)
 class Acts:
-    """An `actor` and a `critic` with their parameters. With more than one stroke asked for, the actor's own action and
-    others about it, by normal noise of standard deviation `noise`, are ranked by the critic."""
+    """An actor and a critic with their parameters.
+
+    Attributes:
+      actor, critic: the networks.
+      of_actor, of_critic: their parameters.
+      noise: where more than one stroke is asked for, the actor's own action and others around it, with normal noise of this
+        standard deviation, are ranked by the critic.
+    """
 
     actor: Actor
     critic: Critic
-    of_actor: Any
-    of_critic: Any
+    of_actor: optax.Params
+    of_critic: optax.Params
     noise: float
 
-    def act(self, observation: Any) -> jax.Array:
+    def act(self, observation: Observation) -> jax.Array:
         """The actor's actions [B, A] for observations [B, ...]."""
         return _act(self.actor, self.of_actor, observation)
 
     def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """The `count` best next strokes [B, count, 4] (m), best first, for goals and current maps [B, H, W] (m), and the
-        critic's values of them [B, count].
+        """Proposes the best next strokes for a batch of goals.
+
+        Args:
+          scene: grid, sand and blade.
+          goal, current: maps [B, H, W] (m).
+          count: how many strokes for each.
+
+        Returns:
+          The strokes [B, count, 4] (m), best first, and the critic's values of them [B, count].
 
         Raises:
-          ValueError: for a scene of another size than it learned on, or without a blade.
+          ValueError: for a scene of another size than the training's, or without a blade.
         """
         if scene.grid.shape != (CELLS, CELLS):
             raise ValueError(f"scene.grid.shape: got {scene.grid.shape}; this policy only knows ({CELLS}, {CELLS})")
@@ -53,16 +67,22 @@ class Acts:
 
 
 @partial(jax.jit, static_argnames="actor")
-def _act(actor: Actor, of_actor: Any, observation: Any) -> jax.Array:
+def _act(actor: Actor, of_actor: optax.Params, observation: Observation) -> jax.Array:
     made: Any = actor.apply(of_actor, observation)
     return made[0]
 
 
 @partial(jax.jit, static_argnames=("actor", "critic", "count"))
 def _best(
-    actor: Actor, critic: Critic, count: int, of_actor: Any, of_critic: Any, maps: Any, off: jax.Array
+    actor: Actor,
+    critic: Critic,
+    count: int,
+    of_actor: optax.Params,
+    of_critic: optax.Params,
+    maps: dict[str, jax.Array],
+    off: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """The best actions [B, count, 4] of those that differ from the actor's by `off` [N, 4], and their values [B, count]."""
+    """The best actions [B, count, 4] among the actor's own moved by `off` [N, 4], and their values [B, count]."""
     actions = jnp.clip(_act(actor, of_actor, maps)[:, None] + off[None], -1, 1)
 
     def value(some: jax.Array) -> jax.Array:

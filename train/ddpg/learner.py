@@ -1,14 +1,14 @@
-"""DDPG with hindsight experience replay, all of it in JAX: environments, memory and updates are one program.
+"""DDPG with hindsight experience replay, all of it in JAX: environments, replay buffer and updates are one program.
 
-Deep deterministic policy gradients (Lillicrap et al. 2016, arXiv:1509.02971). With Q' and pi' slow copies of the critic Q
-and the actor pi, and o' what follows observation o, gradient steps make
+Deep deterministic policy gradients (Lillicrap et al. 2016, arXiv:1509.02971). With Q' and pi' the slowly following target
+copies of the critic Q and the actor pi, and o' the observation after o, gradient steps make
 
     (r + discount (1 - terminated) min(Q'(o', pi'(o')), most(o')) - Q(o, a))^2   smaller, by the critic,
     Q(o, pi(o)) - calm |raw(o)|^2 / A                                            larger, by the actor,
 
-with pi = tanh(raw) in R^A. A time limit is no end: only `terminated` cuts the values off. No value exceeds `most`, which the
-task knows: without that bound they run away, as the original implementation of HER clips them for. Hindsight is in
-`train.replay.her`.
+with pi = tanh(raw) in R^A. A time limit is no end: only `terminated` cuts the values off. No value can exceed `most`, a
+bound that the task knows. Without it values diverge; the original implementation of HER clips them for the same reason.
+Hindsight is in `train.replay.her`.
 """
 
 import math
@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxsand.envs.multi import StrokeParams
 from train.ddpg.acting import Acts
-from train.ddpg.networks import Actor, Critic, Flat, Maps, Sight
+from train.ddpg.networks import Actor, Critic, Flat, Maps, Observation, Sight
 from train.ddpg.tasks import Strokes, Task
 from train.replay.buffer import Buffer
 from train.replay.her import Future, Steps, Strategy, mixed
@@ -32,24 +33,26 @@ _REMEMBERED = jnp.float16  # observations: maps in units of the blade's depth
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Agent:
-    """Parameters of the `actor` and the `critic`, of their slow copies, and both optimisers' states."""
+    """The parameters of actor and critic, of their target copies, and both optimisers' states."""
 
-    actor: Any
-    critic: Any
-    slow_actor: Any
-    slow_critic: Any
-    actor_optimiser: Any
-    critic_optimiser: Any
+    actor: optax.Params
+    critic: optax.Params
+    slow_actor: optax.Params
+    slow_critic: optax.Params
+    actor_optimiser: optax.OptState
+    critic_optimiser: optax.OptState
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Practice:
-    """An agent, what it remembers, where its environments [E] are, and what is drawn next."""
+    """The state of a run: the agent, the replay buffer, the environments' observations and states [E], the key, the chunks
+    done.
+    """
 
     agent: Agent
     memory: Any
-    observation: Any
+    observation: Observation
     world: Any
     key: jax.Array
     chunk: jax.Array
@@ -57,10 +60,10 @@ class Practice:
 
 @dataclass(frozen=True)
 class Ddpg:
-    """A chunk is `steps` steps in each of `envs` environments, then `updates` updates of `batch` steps each.
+    """The learner. A chunk is `steps` steps in each of `envs` environments, then `updates` updates of `batch` steps each.
 
-    In the first `warm` chunks actions are uniform; later a share `random` of them is, and the others are the actor's plus
-    normal noise of a standard deviation `noise`. The memory holds `capacity` rows of `steps` steps.
+    In the first `warm` chunks all actions are uniform. Later a share `random` of them is, and the others are the actor's
+    plus normal noise of standard deviation `noise`. The buffer holds `capacity` rows of `steps` steps.
     """
 
     task: Task = field(default_factory=Strokes)
@@ -85,11 +88,11 @@ class Ddpg:
     def paper(cls) -> "Ddpg":
         """The setting of arXiv:1908.02745 as far as it is known: DDPG with HER, 10,000 episodes, for the multi stroke.
 
-        What it does not say is taken from the original implementation of HER (OpenAI Baselines, Plappert et al. 2018,
-        arXiv:1802.09464): three fully connected layers of 256, both rates 1e-3, slow copies that follow by 5%, batches of
+        What the paper does not say is taken from the original implementation of HER (OpenAI Baselines, Plappert et al. 2018,
+        arXiv:1802.09464): three fully connected layers of 256, both rates 1e-3, target copies that follow by 5%, batches of
         256, four goals in hindsight to one, 30% random actions, noise of 0.2, and a discount of 0.98.
-        Assumed: episodes of three strokes towards what three random strokes make of level sand; the reward
-        L_t - L_{t+1}; one update an episode, where that implementation makes 20, so that it ends in minutes.
+        Assumed: episodes of three strokes towards what three random strokes make of level sand; the reward L_t - L_{t+1};
+        one update an episode, where that implementation makes 20, so that it ends in minutes.
         """
         return cls(
             sight=Flat((256, 256, 256)),
@@ -102,7 +105,7 @@ class Ddpg:
         )
 
     def chunks(self, episodes: int) -> int:
-        """The chunks in which so many episodes are made, if each takes a row of `steps`."""
+        """How many chunks make `episodes` episodes, if each takes a row of `steps`."""
         return math.ceil(episodes / self.envs)
 
     @property
@@ -126,8 +129,13 @@ class Ddpg:
         return begin(self, self.world()[1], jax.random.key(seed))
 
     def advance(self, state: Practice) -> tuple[Practice, dict[str, float]]:
-        """The metrics are the mean reward of the steps made, the critic's `loss`, the `value` of the actor's actions,
-        and how many `steps` were made."""
+        """One chunk of work.
+
+        Returns:
+          The next state, and the metrics: the mean `reward` of the steps made, the critic's `loss`, the `value` of the
+            actor's
+          actions, and how many `steps` were made.
+        """
         state, metrics = practise(self, self.world()[1], state)
         return state, {name: float(value) for name, value in metrics.items()} | {"steps": float(self.envs * self.steps)}
 
@@ -136,12 +144,12 @@ class Ddpg:
         return self.task.validate(self.policy(state))
 
     def policy(self, state: Practice) -> Acts:
-        """What acts."""
+        """The agent as a policy."""
         return Acts(self.actor, self.critic, state.agent.actor, state.agent.critic, self.noise)
 
 
 @partial(jax.jit, static_argnames="learner")
-def begin(learner: Ddpg, params: Any, key: jax.Array) -> Practice:
+def begin(learner: Ddpg, params: StrokeParams | None, key: jax.Array) -> Practice:
     """The state before the first chunk; `params` are the environments'. It may be vmapped over keys."""
     env, _ = learner.world()
     key, first, second, reset = jax.random.split(key, 4)
@@ -157,8 +165,8 @@ def begin(learner: Ddpg, params: Any, key: jax.Array) -> Practice:
 
 
 @partial(jax.jit, static_argnames="learner")
-def practise(learner: Ddpg, params: Any, state: Practice) -> tuple[Practice, dict[str, jax.Array]]:
-    """A chunk. It may be vmapped over states, for many seeds at once."""
+def practise(learner: Ddpg, params: StrokeParams | None, state: Practice) -> tuple[Practice, dict[str, jax.Array]]:
+    """One chunk. It may be vmapped over states, for many seeds at once."""
     key, act, learn = jax.random.split(state.key, 3)
     where, row = _explore(learner, params, state, act)
     memory = _memory(learner).add(state.memory, row)
@@ -173,16 +181,16 @@ def practise(learner: Ddpg, params: Any, state: Practice) -> tuple[Practice, dic
 
 
 def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, jax.Array]]:
-    """One update of both networks and their slow copies from steps [B]."""
+    """Updates both networks and their target copies once, from steps [B]."""
     next_action, _ = _act(learner, agent.slow_actor, some.after)
     ahead = _value(learner, agent.slow_critic, some.after, next_action)
     ahead = jnp.minimum(ahead, learner.task.most(some.after))
     target = some.reward + learner.discount * jnp.where(some.terminated, 0, ahead)
 
-    def critic_loss(critic: Any) -> jax.Array:
+    def critic_loss(critic: optax.Params) -> jax.Array:
         return jnp.mean((target - _value(learner, critic, some.observation, some.action)) ** 2)
 
-    def actor_loss(actor: Any) -> tuple[jax.Array, jax.Array]:
+    def actor_loss(actor: optax.Params) -> tuple[jax.Array, jax.Array]:
         action, raw = _act(learner, actor, some.observation)
         value = jnp.mean(_value(learner, agent.critic, some.observation, action))
         return learner.calm * jnp.mean(raw**2) - value, value
@@ -200,12 +208,14 @@ def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, j
     return new, {"loss": loss, "value": value}
 
 
-def _explore(learner: Ddpg, params: Any, state: Practice, key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
-    """Where the environments are after `steps` steps, and these, [E, T, ...]."""
+def _explore(
+    learner: Ddpg, params: StrokeParams | None, state: Practice, key: jax.Array
+) -> tuple[tuple[Observation, Any], Steps]:
+    """The environments' observations and states after `steps` steps, and these steps, [E, T, ...]."""
     env, _ = learner.world()
     share = jnp.where(state.chunk < learner.warm, 1.0, learner.random)
 
-    def one(where: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
+    def one(where: tuple[Observation, Any], key: jax.Array) -> tuple[tuple[Observation, Any], Steps]:
         observation, world = where
         noise, uniform, which, world_key = jax.random.split(key, 4)
         action, _ = _act(learner, state.agent.actor, observation)
@@ -223,7 +233,7 @@ def _explore(learner: Ddpg, params: Any, state: Practice, key: jax.Array) -> tup
 
 
 def _drawn(learner: Ddpg, key: jax.Array, rows: Steps) -> Steps:
-    """One step of each row [B, T, ...], its goal its own or one in hindsight."""
+    """One step of each row [B, T, ...], with its own goal or one in hindsight."""
     rows = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == _REMEMBERED else x, rows)
 
     def one(key: jax.Array, row: Steps) -> Steps:
@@ -234,12 +244,12 @@ def _drawn(learner: Ddpg, key: jax.Array, rows: Steps) -> Steps:
     return jax.vmap(one)(jax.random.split(key, learner.batch), rows)
 
 
-def _act(learner: Ddpg, actor: Any, observation: Any) -> tuple[jax.Array, jax.Array]:
+def _act(learner: Ddpg, actor: optax.Params, observation: Observation) -> tuple[jax.Array, jax.Array]:
     made: Any = learner.actor.apply(actor, observation)
     return made[0], made[1]
 
 
-def _value(learner: Ddpg, critic: Any, observation: Any, action: jax.Array) -> jax.Array:
+def _value(learner: Ddpg, critic: optax.Params, observation: Observation, action: jax.Array) -> jax.Array:
     value: Any = learner.critic.apply(critic, observation, action)
     return value
 
@@ -252,5 +262,5 @@ def _optimisers(learner: Ddpg) -> tuple[optax.GradientTransformation, optax.Grad
     return optax.adam(learner.actor_rate), optax.adam(learner.critic_rate)
 
 
-def _remembered(observation: Any) -> Any:
+def _remembered(observation: Observation) -> Observation:
     return jax.tree.map(lambda x: x.astype(_REMEMBERED), observation)

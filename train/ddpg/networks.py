@@ -1,20 +1,19 @@
-"""The networks of DDPG: an actor and a critic that see observations as one vector, or as maps."""
+"""The networks of DDPG: an actor and a critic that read observations as one vector, or as maps."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-Observation = Any
+Observation = jax.Array | dict[str, jax.Array]
 """A vector [B, N], or a dictionary of maps [B, H, W], one of them the "goal" and one "current"."""
 
 _SMALL = nn.initializers.variance_scaling(1e-3, "fan_in", "uniform")  # of last layers: actions and values begin near 0
 
 
 class _Flat(nn.Module):
-    """All of an observation, and more beside it [B, M], in one vector."""
+    """Reads all leaves of an observation, and `more` [B, M], as one vector."""
 
     widths: tuple[int, ...]
 
@@ -25,7 +24,7 @@ class _Flat(nn.Module):
 
 
 class _Maps(nn.Module):
-    """Both maps and their difference, in blocks of 4 x 4 cells and then coarser; more beside it [B, M] comes in after."""
+    """Reads both maps and their difference, by blocks of 4 x 4 cells and then coarser; `more` [B, M] joins afterwards."""
 
     channels: tuple[int, ...]
     widths: tuple[int, ...]
@@ -49,7 +48,7 @@ def _dense(x: jax.Array, widths: tuple[int, ...]) -> jax.Array:
 
 @dataclass(frozen=True)
 class Flat:
-    """Fully connected layers on whatever there is to see."""
+    """Fully connected layers on all leaves of an observation."""
 
     widths: tuple[int, ...] = (64, 64)
 
@@ -59,8 +58,10 @@ class Flat:
 
 @dataclass(frozen=True)
 class Maps:
-    """Convolutions on maps whose sides are multiples of 4 x 2^(n - 1), with n the number of `channels`; then fully
-    connected layers."""
+    """Convolutions on maps, then fully connected layers.
+
+    The maps' sides are multiples of 4 x 2^(n - 1), with n the number of `channels`.
+    """
 
     channels: tuple[int, ...] = (32, 64)
     widths: tuple[int, ...] = (256, 128)
@@ -73,7 +74,7 @@ Sight = Flat | Maps
 
 
 class Actor(nn.Module):
-    """The action [B, A] from -1 to 1 in each entry, and what tanh makes it of."""
+    """The actor: its actions [B, A], -1 to 1, and the numbers whose tanh they are."""
 
     look: nn.Module
     size: int
@@ -85,7 +86,7 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """The value [B] of actions [B, A]."""
+    """The critic: the values [B] of actions [B, A]."""
 
     look: nn.Module
 

@@ -1,8 +1,7 @@
-"""What DDPG is set to do: an environment, what hindsight gives for it, and how what it learned is judged."""
+"""Tasks of DDPG: an environment, rewards for goals in hindsight, and how a policy is judged."""
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +25,10 @@ _SHORTEST = 0.15  # stroke of a goal, of the glyphs' square
 
 @dataclass(frozen=True)
 class Strokes:
-    """Episodes of `count` strokes by the full push towards one of `goals` goals that as many random strokes make of level
-    sand; `trials` others are set apart."""
+    """Episodes of `count` strokes by the full push towards goals that as many random strokes make of level sand.
+
+    There are `goals` goals to practise on, and `trials` others to validate on.
+    """
 
     count: int = 3
     goals: int = 1024
@@ -38,11 +39,11 @@ class Strokes:
         return _ENV, _goals(self.count, self.goals, _PRACTICE)
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The environment's reward for any goal, from maps [H, W] in units of the blade's depth; no goal is an end."""
+        """The reward for any goal, from maps [H, W] in units of the blade's depth, and False: no goal ends an episode."""
         reward = jnp.sqrt(jnp.sum((goal - before) ** 2)) - jnp.sqrt(jnp.sum((goal - after) ** 2))
         return reward, jnp.zeros((), bool)
 
-    def most(self, observation: Any) -> jax.Array:
+    def most(self, observation: dict[str, jax.Array]) -> jax.Array:
         """An upper bound [B] of every value: with rewards L_t - L_{t+1}, L >= 0 and a discount g <= 1,
 
         sum_t g^t (L_t - L_{t+1}) = L_0 - (1 - g) sum_t g^t L_{t+1} <= L_0.
@@ -50,7 +51,11 @@ class Strokes:
         return jnp.sqrt(jnp.sum((observation["goal"] - observation["current"]) ** 2, (1, 2)))
 
     def validate(self, acts: Acts) -> dict[str, float]:
-        """On goals set apart: the mean share of the l2 distance that is gone, `score`, and how many are `right`."""
+        """Judges a policy on goals set apart.
+
+        Returns:
+          `score`, the mean share of the l2 distance that is gone, and `right`, the share of goals that are right.
+        """
         params = _goals(self.count, self.trials, _SET_APART)
         goal, depth = np.asarray(params.goals.goals), float(Blade().depth)
         _, maps = one_after_the_other(acts, params.scene, np.zeros_like(goal), goal, self.count)
@@ -70,11 +75,11 @@ class Probing:
         return self.probe, None
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Nothing, since a probe has no goals."""
+        """No reward and no end, since a probe has no goals."""
         return jnp.zeros(()), jnp.zeros((), bool)
 
-    def most(self, observation: Any) -> jax.Array:
-        """None is needed."""
+    def most(self, observation: jax.Array) -> jax.Array:
+        """No bound, [B]."""
         return jnp.full(len(observation), jnp.inf, observation.dtype)
 
     def validate(self, acts: Acts) -> dict[str, float]:
@@ -91,7 +96,7 @@ Task = Strokes | Probing
 
 @cache
 def _goals(count: int, goals: int, seed: int) -> StrokeParams:
-    """The environment's parameters, with goals that random strokes leave; none whose outcome is not clean."""
+    """The environment's parameters, with goals that random strokes leave; goals whose outcome is not clean are left out."""
     scene = usual_scene()
     plans = np.stack(RandomStrokes(goals, count, count, _SHORTEST).plans(np.random.default_rng(seed)))
     maps = np.zeros((goals, *scene.grid.shape), np.float32)

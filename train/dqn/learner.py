@@ -1,12 +1,12 @@
-"""Deep Q-learning with hindsight on the single stroke: a map of cells, dug by one walk in as few steps as can be.
+"""Deep Q-learning with hindsight on the single stroke: a map of cells, dug by one walk in as few steps as possible.
 
-Many environments walk side by side, each on random maps of its own; what they do is learned from with its own goal, or with
-the cells dug in the end as the goal (hindsight, `train.replay.her`). The network looks at the map from where the tool
-stands, and illegal actions are never compared. With Q' a slow copy of the network, the target of an action is either
+Many environments walk side by side, each on random maps of its own. A walk is learned from with its own goal, or with the
+cells dug at its end as the goal (hindsight, `train.replay.her`). The network sees the map as seen from the tool, and illegal
+actions are never compared. With Q' a slowly following copy of the network, the target of an action is either
 
     Sampled:  r + gamma Q'(s', argmax Q(s', .)), over `reach` steps as they were taken (double DQN), or
     Every:    r + gamma max Q'(s', .) by the model's next state, for each legal action: approximate value iteration on the
-              states that the walks come by. It wins by far, and is the default; `Dqn.plain()` is the other.
+              states that the walks visit. It wins by far, and is the default; `Dqn.plain()` is the other.
 
 Mnih et al. 2015 (doi:10.1038/nature14236); van Hasselt et al. 2016; Wang et al. 2016; Andrychowicz et al. 2017.
 """
@@ -20,24 +20,39 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxsand.envs.onmap import MapParams, MapState
+from train.ddpg.networks import Observation
 from train.dqn.networks import Bins, Greedy, Head, Mean, QNet
 from train.dqn.targets import Backup, Every, Items, Sampled, items_of
 from train.dqn.tasks import SingleStroke, Task
+from train.evaluation.probes import ProbeState
 from train.replay.buffer import Buffer
 from train.replay.her import Final, Steps, Strategy, chosen, relabel
+
+Learned = tuple[optax.Params, optax.Params, optax.OptState]
+"""A network's parameters, their moving average, and the optimiser's state."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Walking:
-    """The network's `params`, their moving `average` (the target network, and what acts), the optimiser's state, what is
-    remembered, the environments' observations and states [E], the key of what is drawn next, and the chunks done."""
+    """The state of a run.
 
-    params: Any
-    average: Any
-    optimiser: Any
+    Attributes:
+      params: of the network.
+      average: their moving average, which is the target network, and what acts.
+      optimiser: its state.
+      memory: the replay buffer's state.
+      observation, world: the environments' observations and states [E].
+      key: of what is drawn next.
+      chunk: chunks done.
+    """
+
+    params: optax.Params
+    average: optax.Params
+    optimiser: optax.OptState
     memory: Any
-    observation: Any
+    observation: Observation
     world: Any
     key: jax.Array
     chunk: jax.Array
@@ -45,7 +60,8 @@ class Walking:
 
 @dataclass(frozen=True)
 class Dqn:
-    """A chunk is `steps` steps in each of `envs` environments, then `updates` updates by Adam on `batch` items each.
+    """The learner. A chunk is `steps` steps in each of `envs` environments, then `updates` updates by Adam on `batch` items
+    each.
 
     The share of random actions goes from `careful` to its eighth root over the environments (as in Ape-X,
     arXiv:1803.00933). The learning rate falls as 1 / sqrt(chunk) after `decay` chunks.
@@ -72,7 +88,7 @@ class Dqn:
 
     @classmethod
     def plain(cls) -> "Dqn":
-        """Double dueling DQN with hindsight on three-step returns as they were sampled, a value being a number."""
+        """Double dueling DQN with hindsight on sampled three-step returns, a value being one number."""
         return cls(backup=Sampled(), head=Mean(), reach=3)
 
     @property
@@ -87,25 +103,30 @@ class Dqn:
         return begin(self, jax.random.key(seed))
 
     def advance(self, state: Walking) -> tuple[Walking, dict[str, float]]:
-        """The metrics are the mean loss, the mean reward of a step, and the share of steps that finished their map,
-        and how many `steps` were made."""
+        """One chunk of work.
+
+        Returns:
+          The next state, and the metrics: the mean `loss`, the mean `reward` of a step, the share of steps that finished
+            their map
+          (`done`), and how many `steps` were made.
+        """
         state, metrics = practise(self, state)
         return state, {name: float(value) for name, value in metrics.items()} | {"steps": float(self.envs * self.steps)}
 
     def validate(self, state: Walking) -> dict[str, float]:
-        """What greedy walks reach on goals set apart; see the task."""
+        """What greedy walks reach on maps set apart; see the task."""
         return self.task.validate(self.policy(state))
 
     def walker(self, state: Walking) -> Greedy:
-        """What acts while it learns."""
+        """The policy that acts while it learns."""
         return Greedy(self.net, state.average)
 
     def policy(self, state: Walking) -> Greedy:
-        """What acts when it is judged; see the task."""
+        """The policy that is judged; see the task."""
         return self.task.policy(self.walker(state))
 
     def ring(self) -> Buffer:
-        """What remembers."""
+        """The replay buffer."""
         return Buffer(self.capacity, self.batch)
 
 
@@ -126,7 +147,7 @@ def begin(learner: Dqn, key: jax.Array) -> Walking:
 
 @partial(jax.jit, static_argnames="learner")
 def practise(learner: Dqn, state: Walking) -> tuple[Walking, dict[str, jax.Array]]:
-    """A chunk. It may be vmapped over states, for many seeds at once."""
+    """One chunk. It may be vmapped over states, for many seeds at once."""
     key, goals, walk, hindsight, learn = jax.random.split(state.key, 5)
     params = learner.task.world(goals)
     (seen, world), rows = _walk(learner, state, params, walk)
@@ -140,13 +161,17 @@ def _optimiser() -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(10.0), optax.scale_by_adam())
 
 
-def _walk(learner: Dqn, state: Walking, params: Any, key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
+def _walk(
+    learner: Dqn, state: Walking, params: MapParams | None, key: jax.Array
+) -> tuple[tuple[Observation, MapState | ProbeState], Steps]:
     """The environments' last observations and states [E, ...], and their steps [T, E, ...]."""
     task: Any = learner.task
     number, policy = learner.envs, learner.walker(state)
     share = learner.careful ** jnp.linspace(1 / 8, 1, number)
 
-    def one(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Steps]:
+    def one(
+        carry: tuple[Observation, MapState | ProbeState], key: jax.Array
+    ) -> tuple[tuple[Observation, MapState | ProbeState], Steps]:
         seen, world = carry
         chance, choose, step = jax.random.split(key, 3)
         legal = jax.vmap(task.legal)(seen)
@@ -162,8 +187,11 @@ def _walk(learner: Dqn, state: Walking, params: Any, key: jax.Array) -> tuple[tu
 
 
 def _items(learner: Dqn, rows: Steps, key: jax.Array) -> Items:
-    """Items [E T] of steps [T, E, ...]: one environment in 1 + copies, and where a goal in hindsight is barred, keeps its
-    own goals; the others learn in hindsight."""
+    """Items [E T] of steps [T, E, ...].
+
+    One environment in 1 + copies keeps its own goals, and so does one whose goals in hindsight are barred; the others learn
+    in hindsight.
+    """
     task, strategy = learner.task, learner.strategy
     rows = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), rows)
     if strategy.copies:
@@ -177,20 +205,20 @@ def _items(learner: Dqn, rows: Steps, key: jax.Array) -> Items:
 
 
 def _learn(
-    learner: Dqn, state: Walking, params: Any, sample: Callable[[jax.Array], Items], key: jax.Array
-) -> tuple[tuple[Any, Any, Any], jax.Array]:
+    learner: Dqn, state: Walking, params: MapParams | None, sample: Callable[[jax.Array], Items], key: jax.Array
+) -> tuple[Learned, jax.Array]:
     """The network's parameters, their average and the optimiser's state after the chunk's updates, and the losses."""
     net = learner.net
     rate = learner.rate * jnp.minimum(1.0, jnp.sqrt(learner.decay / (state.chunk + 1.0)))
 
-    def one(carry: tuple[Any, Any, Any], key: jax.Array) -> tuple[tuple[Any, Any, Any], jax.Array]:
+    def one(carry: Learned, key: jax.Array) -> tuple[Learned, jax.Array]:
         own, average, optimiser = carry
         items = sample(key)
         targets, weights = learner.backup.targets(
             learner.task, params, learner.gamma, items, Greedy(net, own).values, Greedy(net, average).values
         )
 
-        def loss(own: Any) -> jax.Array:
+        def loss(own: optax.Params) -> jax.Array:
             made: Any = net.apply(own, items.observation)
             return jnp.mean(jnp.sum(weights * net.head.loss(made, targets), axis=1))
 

@@ -1,4 +1,4 @@
-"""Random maps drawn the way letters are: a few straight lines, across, along or in stairs, each from a cell already dug."""
+"""Random maps drawn as letters are: a few straight lines, across, along or in stairs, each from a cell already dug."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -17,11 +17,11 @@ _SECOND = np.array([0, 1, 2, 3, 1, 2, 3, 0])  # a line's odd steps, by its way; 
 
 @dataclass(frozen=True)
 class Shapes:
-    """Six to sixteen lines of two to six steps, of which the map's edge, and the other lines, take a part in.
+    """Draws six to sixteen lines of two to six steps, cut off at the map's edge.
 
-    Lines start at the last one's end with probability `onward`, else on any cell, and are stairs with probability
-    `stairs`. One that would fill a block of 2 x 2 cells is left out with probability `thin`: letters are one cell wide.
-    The stroke starts on any cell.
+    A line starts at the last one's end with probability `onward`, else on any cell already dug, and goes in stairs with
+    probability `stairs`. A line that would fill a block of 2 x 2 cells is left out with probability `thin`: letters are one
+    cell wide. The stroke starts on any cell.
     """
 
     onward: float = 0.4
@@ -53,7 +53,10 @@ class Shapes:
 
 @partial(jax.jit, static_argnames=("shapes", "count", "shape"))
 def shape_pool(shapes: Shapes, key: jax.Array, count: int, shape: tuple[int, int], barred: jax.Array) -> MapPool:
-    """So many random maps, but for those `barred` [N, H, W], for which the first that is not stands in; see `among`."""
+    """Draws `count` random maps and their starts, none of them among `barred` [N, H, W]; see `among`.
+
+    The first map that is not barred stands in for those that are.
+    """
     dig, starts = jax.vmap(lambda k: shapes.draw(k, shape))(jax.random.split(key, count))
     out = among(dig, barred)
     own = jnp.where(out, jnp.argmin(out), jnp.arange(count))
@@ -61,7 +64,7 @@ def shape_pool(shapes: Shapes, key: jax.Array, count: int, shape: tuple[int, int
 
 
 def among(dig: jax.Array, barred: jax.Array) -> jax.Array:
-    """Which maps [G, H, W] are one of the maps [N, H, W], shifted or as it is [G]."""
+    """Which of the maps [G, H, W] equal one of the maps `barred` [N, H, W] up to a shift, [G]."""
     ours, theirs = jax.vmap(_to_corner)(dig), jax.vmap(_to_corner)(barred)
     return jnp.any(jnp.all(ours[:, None] == theirs[None], axis=(2, 3)), axis=1)
 
@@ -73,19 +76,19 @@ def _to_corner(dig: jax.Array) -> jax.Array:
 
 
 def _whole(chance: jax.Array, low: int, high: int) -> jax.Array:
-    """A whole number from low to high, each as likely, of a chance from 0 to 1."""
+    """A whole number from low to high with equal chances, from a number `chance` between 0 and 1."""
     return low + (chance * (high - low + 1)).astype(jnp.int32)
 
 
 def _any_of(chance: jax.Array, dig: jax.Array) -> jax.Array:
-    """The row and column of a true cell, each as likely, of a chance from 0 to 1."""
+    """The row and column of a true cell with equal chances, from a number `chance` between 0 and 1."""
     rank = jnp.cumsum(dig.ravel())
     which = jnp.argmax(rank > (chance * rank[-1]).astype(rank.dtype))
     return jnp.stack(jnp.divmod(which, dig.shape[1])).astype(jnp.int32)
 
 
 def _line(dig: jax.Array, place: jax.Array, way: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The map with one line more, and where that ends."""
+    """The map with one more line, and the cell where that ends."""
     both = jnp.asarray(STEPS)[jnp.stack([way % 4, jnp.asarray(_SECOND)[way]])]
 
     def one(t: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

@@ -1,4 +1,4 @@
-"""Networks of action values: what they look at, how state and action come together (dueling), and how a value is written."""
+"""Networks of action values: their features, their dueling outputs, and how a value is encoded."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,14 +9,16 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from train.ddpg.networks import Observation
+
 
 @dataclass(frozen=True)
 class Mean:
-    """A value is a number; the loss is Huber's."""
+    """Encodes a value as one number; the loss is Huber's."""
 
     @property
     def count(self) -> int:
-        """How many outputs write one value."""
+        """Outputs for one value."""
         return 1
 
     def value(self, raw: jax.Array) -> jax.Array:
@@ -30,10 +32,10 @@ class Mean:
 
 @dataclass(frozen=True)
 class Bins:
-    """A value is the mean of a distribution over `count` numbers from `low` to `high`, and none is ever beyond them.
+    """Encodes a value as the mean of a distribution over `count` numbers from `low` to `high`, which no value can leave.
 
-    The loss is the cross-entropy with a target that is shared out between the two nearest numbers (Farebrother et al.
-    2024, arXiv:2403.03950, "two-hot").
+    The loss is the cross-entropy with a target that is divided between the two nearest numbers (Farebrother et al. 2024,
+    arXiv:2403.03950, "two-hot").
     """
 
     low: float = -31.0
@@ -56,7 +58,7 @@ Head = Mean | Bins
 
 
 def dueling(state: jax.Array, advantage: jax.Array) -> jax.Array:
-    """Outputs [..., A, K] of a state's [..., K] and its actions' advantages [..., A, K], less their mean over actions.
+    """Joins the outputs of a state [..., K] with its actions' advantages [..., A, K], less their mean over actions.
 
     Wang et al. 2016, arXiv:1511.06581, equation 9; for distributions as in Rainbow, arXiv:1710.02298.
     """
@@ -76,7 +78,7 @@ class QNet(nn.Module):
     blocks: int
 
     @nn.compact
-    def __call__(self, observation: Any) -> jax.Array:
+    def __call__(self, observation: Observation) -> jax.Array:
         x = nn.relu(nn.Dense(self.width)(self.look(observation)))
         for _ in range(self.blocks):
             y = nn.relu(nn.Dense(self.width)(nn.LayerNorm()(x)))
@@ -89,18 +91,18 @@ class QNet(nn.Module):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Greedy:
-    """A network with its parameters, and the legal action that it likes best."""
+    """A network with its parameters; it acts by the legal action of the highest value."""
 
     net: QNet = field(metadata={"static": True})
-    params: Any
+    params: optax.Params
 
-    def values(self, observation: Any) -> jax.Array:
+    def values(self, observation: Observation) -> jax.Array:
         """Action values [B, A] of observations [B, ...]."""
         raw: Any = self.net.apply(self.params, observation)
         return self.net.head.value(raw)
 
-    def act(self, observation: Any, legal: jax.Array) -> jax.Array:
-        """The `legal` [B, A] action [B] of the highest value."""
+    def act(self, observation: Observation, legal: jax.Array) -> jax.Array:
+        """The legal action [B] of the highest value; `legal` is [B, A]."""
         return best(self.values(observation), legal)
 
 
@@ -110,18 +112,20 @@ def best(values: jax.Array, legal: jax.Array) -> jax.Array:
 
 
 def of(values: jax.Array, action: jax.Array) -> jax.Array:
-    """The values [B], of [B, A], of actions [B]."""
+    """The values [B] of the actions [B] in a table of values [B, A]."""
     return jnp.take_along_axis(values, action[:, None], axis=1)[:, 0]
 
 
-def flat(observation: Any) -> jax.Array:
-    """All of an observation, side by side [B, F]."""
+def flat(observation: Observation) -> jax.Array:
+    """All leaves of an observation side by side, [B, F]."""
     leaves = jax.tree.leaves(observation)
     return jnp.concatenate([jnp.asarray(x, jnp.float32).reshape(len(x), -1) for x in leaves], axis=1)
 
 
 def around(observation: dict[str, jax.Array]) -> jax.Array:
-    """The goal's cells still to dig and those dug [B, 2 (2 H - 1) (2 W - 1)], with the tool's place in the middle."""
+    """The goal's cells still to dig, and those dug, as seen from the tool: [B, 2 (2 H - 1) (2 W - 1)], the tool in the
+    middle.
+    """
     goal, dug, pose = (observation[name].astype(jnp.float32) for name in ("goal", "current", "pose"))
     batch, rows, columns = goal.shape
     place = jnp.argmax(pose.reshape(batch, -1), axis=1)

@@ -1,7 +1,7 @@
-"""The eight turns and mirrors of a map, and a policy that looks at all of them.
+"""The eight turns and mirrors of a map, and a policy that averages over all of them.
 
-The shortest walk over a mirrored map is the mirrored walk, so the mean of what a network says of all eight views is right
-where it is, and its mistakes, which differ from view to view, weigh less.
+The shortest walk over a mirrored map is the mirrored walk. So the mean of a network's values over all eight views is as
+right as each, while its mistakes, which differ from view to view, weigh less.
 """
 
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from jaxsand.planning.learned.square_symmetries import turned_back as turned
 from train.dqn.networks import Greedy
 
 VIEWS = range(8)
-"""Bit 0 swaps rows and columns, then bit 1 turns rows and bit 2 columns round."""
+"""The bits of a view: bit 0 swaps rows and columns, then bit 1 flips the rows and bit 2 the columns."""
 
 
 def turned_steps(view: int) -> np.ndarray:
-    """For each step [4], which one it is in another view."""
+    """For each of the steps N, E, S, W, [4], which step it is in another view."""
     steps = STEPS[:, ::-1] if view & 1 else STEPS
     steps = steps * np.array([-1 if view >> axis & 1 else 1 for axis in (1, 2)])
     return np.argmax((steps[:, None] == STEPS[None]).all(-1), axis=1)
@@ -29,7 +29,7 @@ def turned_steps(view: int) -> np.ndarray:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Symmetric(Greedy):
-    """The mean of a network's values over all views of square maps."""
+    """A network whose values are averaged over all views of square maps."""
 
     def values(self, observation: Any) -> jax.Array:
         """Action values [B, 4] of planes [B, H, H]."""

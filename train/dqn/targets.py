@@ -1,4 +1,4 @@
-"""What an action value is learned from: rows of steps become items, and items targets."""
+"""Targets for action values: rows of steps become items, and items become targets."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,19 +7,28 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsand.envs.onmap import MapParams
+from train.ddpg.networks import Observation
 from train.dqn.networks import best, of
 from train.dqn.tasks import Task
 from train.replay.her import Steps, last_steps
 
-Values = Callable[[Any], jax.Array]
+Values = Callable[[Observation], jax.Array]
 """Observations [B, ...] to the values of their actions [B, A]."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Items:
-    """From an `observation` an `action`, and those that followed, earned `total` (discounted) and led to `after`, whose
-    value counts `discount` times: 0 where the episode terminated."""
+    """Items to learn an action value from.
+
+    Attributes:
+      observation: what was seen.
+      action: what was done.
+      total: the discounted sum of the rewards of this and the following steps of the item.
+      after: the observation after them.
+      discount: how much the value of `after` counts; 0 where the episode terminated.
+    """
 
     observation: Any
     action: jax.Array
@@ -45,16 +54,25 @@ def items_of(steps: Steps, reach: int, gamma: float) -> Items:
 
 @dataclass(frozen=True)
 class Sampled:
-    """Double DQN: total + discount x the target network's value of the action that the online network likes best after.
+    """Double DQN: the target is total + discount x the target network's value of the online network's best action
+    afterwards.
 
-    Only the action that was taken has a target. van Hasselt et al. 2016, arXiv:1509.06461; for a reach of several steps
-    without correction for what the policy would have done, as in Rainbow.
+    Only the action that was taken has a target. Source: van Hasselt et al. 2016, arXiv:1509.06461. A reach of several
+    steps is not corrected for what the policy would have done, as in Rainbow.
     """
 
     def targets(
-        self, task: Task, world: Any, gamma: float, items: Items, online: Values, slow: Values
+        self, task: Task, world: MapParams | None, gamma: float, items: Items, online: Values, slow: Values
     ) -> tuple[jax.Array, jax.Array]:
-        """Targets [B, A] and their weights, of which a row's sum is 1; `slow` is the target network."""
+        """Targets [B, A] and their weights [B, A], which sum to 1 in a row.
+
+        Args:
+          task: the environment and its legal actions.
+          world: the environment's parameters.
+          gamma: discount.
+          items: [B].
+          online, slow: action values by the online network and by the target network.
+        """
         legal = jax.vmap(task.legal)(items.after)
         ahead = of(slow(items.after), best(online(items.after), legal))
         taken = jax.nn.one_hot(items.action, task.actions, dtype=ahead.dtype)
@@ -63,20 +81,20 @@ class Sampled:
 
 @dataclass(frozen=True)
 class Every:
-    """Value iteration by the model: for each legal action, reward + gamma x the target network's best value of what follows.
+    """Value iteration with the environment as a model: for each legal action, reward + gamma x the best value of what
+    follows.
 
-    A walk that terminated within an item's reach is a lower bound for the action that it began with, where nothing is left
-    to chance (He et al. 2017, arXiv:1611.01606). Needs the environment's step as a model, which `Sampled` does not.
-
-    There is room for `branches` actions of an item on average; what exceeds it, at the batch's end, has no target.
+    The value is the target network's. A walk that terminated within an item's reach is a lower bound for the action that
+    it began with, where nothing is left to chance (He et al. 2017, arXiv:1611.01606). There is room for `branches`
+    actions of an item on average; actions beyond that, at the batch's end, have no target.
     """
 
     branches: int = 2
 
     def targets(
-        self, task: Task, world: Any, gamma: float, items: Items, online: Values, slow: Values
+        self, task: Task, world: MapParams | None, gamma: float, items: Items, online: Values, slow: Values
     ) -> tuple[jax.Array, jax.Array]:
-        """Targets [B, A] and their weights, of which a row's sum is 1 or, without room, 0; `slow` is the target network."""
+        """Targets [B, A] and their weights [B, A], which sum to 1 in a row, or to 0 without room; see `Sampled.targets`."""
         legal = jax.vmap(task.legal)(items.observation)
         batch, actions = legal.shape
         (which,) = jnp.nonzero(legal.ravel(), size=self.branches * batch, fill_value=legal.size)

@@ -1,4 +1,4 @@
-"""What a learner of action values is set to do: an environment, goals, what its network looks at, and how it is judged."""
+"""Tasks of DQN: an environment, goals, what the network sees, and how a policy is judged."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,10 +26,11 @@ _COST = 1.0  # of a step
 
 @dataclass(frozen=True)
 class SingleStroke:
-    """The fewest steps that dig maps of random `shapes`, `pool` new ones in every chunk; a walk is given up after `limit`.
+    """Digs maps of random `shapes` in the fewest steps; `pool` new maps in every chunk, walks of at most `limit` steps.
 
-    A step's reward is -1, and 1 more when it digs a new cell. So the sum of rewards is minus the steps beyond one for each
-    cell to dig, 0 at best, and largest for the shortest walk. No letter is ever a goal, nor is a map set apart.
+    A step's reward is -1, and 1 more when it digs a new cell. So the sum of rewards is minus the number of steps beyond one
+    for each cell to dig: 0 at best, and largest for the shortest walk. Letters, and the maps for validation, are never
+    goals.
     """
 
     env: OnMap = field(default_factory=OnMap)
@@ -55,32 +56,36 @@ class SingleStroke:
         return self.env.legal(self.state(observation), MapParams())
 
     def packed(self, observation: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """An observation as it is kept."""
+        """An observation as it is stored."""
         return {name: plane > 0.5 for name, plane in observation.items()}
 
     def state(self, observation: dict[str, jax.Array]) -> MapState:
-        """The environment's state that an observation shows; its time is 0."""
+        """The environment's state that an observation shows, with time 0."""
         goal, dug, pose = (observation[name] for name in ("goal", "current", "pose"))
         place = jnp.stack(jnp.divmod(jnp.argmax(pose), pose.shape[1])).astype(jnp.int32)
         return MapState(goal > 0.5, dug > 0.5, place, jnp.zeros((), jnp.int32))
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The environment's reward for any goal, and whether it is dug."""
+        """The reward for any goal, and whether the goal is dug."""
         left, still = (jnp.sum(goal & ~dug) for dug in (before, after))
         return jnp.float32(left - still) - jnp.float32(_COST), still == 0
 
     def barred(self, observations: dict[str, jax.Array]) -> jax.Array:
-        """Which observations [B, ...] have a goal that is never to be learned from [B]."""
+        """Which observations [B, ...] have a goal that must not be learned from, [B]."""
         return among(observations["goal"], jnp.asarray(_barred(self)))
 
     def policy(self, own: Greedy) -> Greedy:
-        """What is judged: on square maps, the mean of all views."""
+        """The policy that is judged: on square maps, the mean over all eight views."""
         rows, columns = self.env.shape
         return Symmetric(own.net, own.params) if rows == columns else own
 
     def validate(self, policy: Greedy) -> dict[str, float]:
-        """On random maps set apart: the share `solved`, the share solved in the fewest steps (`optimal`), and the mean of
-        fewest steps / steps, 0 for a map that is not solved (`score`)."""
+        """Judges a policy on random maps set apart.
+
+        Returns:
+          `solved`, the share of maps solved; `optimal`, the share solved in the fewest steps; and `score`, the mean of
+          fewest steps / steps, 0 for a map that is not solved.
+        """
         steps, few = walks(policy, _set_apart(self)), _fewest_apart(self)
         good = steps > 0
         return {
@@ -92,7 +97,7 @@ class SingleStroke:
 
 @dataclass(frozen=True)
 class Asking:
-    """A probe environment of actions 0 and 1, all of them legal."""
+    """A probe environment with actions 0 and 1, both always legal."""
 
     probe: Probe
 
@@ -116,7 +121,7 @@ class Asking:
         return jnp.ones(self.actions, bool)
 
     def packed(self, observation: jax.Array) -> jax.Array:
-        """An observation as it is kept."""
+        """An observation as it is stored."""
         return observation
 
     def state(self, observation: jax.Array) -> ProbeState:
@@ -124,15 +129,15 @@ class Asking:
         return ProbeState(observation[0], observation[1].astype(jnp.int32))
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """A probe has no goals."""
+        """Raises ValueError: a probe has no goals."""
         raise ValueError("strategy: a probe has no goals; learn without hindsight, with Own()")
 
     def barred(self, observations: jax.Array) -> jax.Array:
-        """None is [B]."""
+        """No observation is barred, [B]."""
         return jnp.zeros(len(observations), bool)
 
     def policy(self, own: Greedy) -> Greedy:
-        """What is judged."""
+        """The policy that is judged."""
         return own
 
     def validate(self, policy: Greedy) -> dict[str, float]:

@@ -1,15 +1,16 @@
-"""How many maps a learner of action values digs by one walk, and in how many steps beside the fewest there are.
+"""How many maps a DQN digs by one walk, and in how many steps compared with the fewest.
 
-A walk is greedy: the legal step of the highest value, without a search or a model. One that has taken `MOST` steps for
-each cell, as one that goes round in circles has, is given up: its map is not solved. Walks start where the map says, and the
-fewest steps are the planner's from there, proven. Looking ahead is another stage: a beam of plans, by the model.
+A walk is greedy: it takes the legal step of the highest value, without a search or a model. A walk that has taken `MOST`
+steps for each cell, such as one that goes round in circles, is given up, and its map is not solved. Walks start where the
+map says, and the fewest steps are the planner's from there, proven. Look-ahead is a beam of plans that uses the environment
+as a model.
 """
 
 import time
 from collections.abc import Mapping
 from functools import partial
 from string import ascii_uppercase
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -17,19 +18,25 @@ import numpy as np
 from jax import lax
 
 from jaxsand.envs.maps import STEPS, MapPool, map_pool
-from jaxsand.envs.onmap import MapParams, OnMap
+from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.goals import letters as goals
 from jaxsand.planning.binary import Cell, plan
 from jaxsand.scene.progress import Tell, quiet
 from train.dqn.networks import Greedy, best, of
 
+if TYPE_CHECKING:
+    from train.dqn.learner import Dqn, Walking
+
 MOST = 3
 """Steps for each cell."""
 
+_Carry = tuple[dict[str, jax.Array], MapState, jax.Array, jax.Array]  # observations, states, steps taken, the step's number
+_Beam = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # dug, places, alive, steps taken, the step's number
+
 
 def evaluate(
-    learner: Any,
-    state: Any,
+    learner: "Dqn",
+    state: "Walking",
     maps: Mapping[str, tuple[np.ndarray, Cell | None]] | None = None,
     width: int = 0,
     tell: Tell = quiet,
@@ -37,15 +44,19 @@ def evaluate(
     """How many maps are `solved`, and how many in the fewest steps (`optimal`).
 
     Args:
-      maps: by name, cells [H, W] to dig and a start, or None for the planner's; the 26 letters with theirs, if None.
+      learner: the DQN.
+      state: its state.
+      maps: by name the cells [H, W] to dig and a start, or None for the planner's; without maps the 26 letters with theirs.
       width: of the beam of plans that looks ahead; 0 walks greedily.
+      tell: is called with a line of progress.
 
     Raises:
       ValueError: for maps of another shape than the learner's, or as `jaxsand.env.map_pool` does.
     """
     began = time.perf_counter()
     maps = maps or {letter: goals.letter_map(letter) for letter in ascii_uppercase}
-    shape = learner.task.env.shape
+    env: Any = learner.task.env
+    shape = env.shape
     for name, (dig, _) in maps.items():
         if np.shape(dig) != shape:
             raise ValueError(f"maps: {name!r} has shape {list(np.shape(dig))}; give maps of {list(shape)} cells")
@@ -70,20 +81,23 @@ def evaluate(
 
 
 def fewest(pool: MapPool) -> np.ndarray:
-    """The fewest steps [G] there are, by the planner."""
+    """The fewest steps [G] of the maps, by the planner."""
     starts = [(int(row), int(column)) for row, column in np.asarray(pool.starts)]
     plans = [plan(dig, start, engine="exact") for dig, start in zip(np.asarray(pool.dig), starts, strict=True)]
     return np.array([one.steps for one in plans])
 
 
 def walks(policy: Greedy, pool: MapPool) -> np.ndarray:
-    """The steps [G] of greedy walks on maps [G, H, W]; 0 where a map is not solved."""
+    """The steps [G] of greedy walks on a pool's maps; 0 where a map is not solved."""
     return np.asarray(_walks(policy, pool))
 
 
 def beams(policy: Greedy, pool: MapPool, width: int) -> np.ndarray:
-    """The steps [G] of the shortest plan in a beam: of all steps from `width` plans, as many different ones go on whose
-    rewards so far, and value of what is left, are highest. 0 where a map is not solved."""
+    """The steps [G] of the shortest plan found by a beam search; 0 where a map is not solved.
+
+    Of all steps from `width` plans, `width` different ones go on whose rewards so far plus value of what is left are
+    highest.
+    """
     return np.asarray(_beams(policy, pool, width))
 
 
@@ -94,11 +108,11 @@ def _walks(policy: Greedy, pool: MapPool) -> jax.Array:
     seen, states = jax.vmap(lambda dig, at: env.reset(key, MapParams(MapPool(dig[None], at[None]))))(pool.dig, pool.starts)
     most = MOST * jnp.sum(pool.dig, axis=(1, 2))
 
-    def going(carry: Any) -> jax.Array:
+    def going(carry: _Carry) -> jax.Array:
         _, _, steps, number = carry
         return jnp.any((steps == 0) & (number < most))
 
-    def one(carry: Any) -> Any:
+    def one(carry: _Carry) -> _Carry:
         seen, states, steps, number = carry
         action = policy.act(seen, jax.vmap(env.legal, (0, None))(states, MapParams()))
         seen, states, _, over, _, _ = jax.vmap(env.step_env, (None, 0, 0, None))(key, states, action, MapParams())
@@ -126,11 +140,11 @@ def _beams(policy: Greedy, pool: MapPool, width: int) -> jax.Array:
         dug = jax.nn.one_hot(jnp.full(width, first), dig.size, dtype=bool)
         most = MOST * jnp.sum(dig)
 
-        def going(carry: Any) -> jax.Array:
+        def going(carry: _Beam) -> jax.Array:
             _, _, _, steps, number = carry
             return (steps == 0) & (number < most)
 
-        def step(carry: Any) -> Any:
+        def step(carry: _Beam) -> _Beam:
             dug, place, alive, _, number = carry
             new = to[place].ravel()
             legal = (alive[:, None] & on[place]).ravel() & dig[new]

@@ -1,4 +1,4 @@
-"""Sets of glyphs to judge learners by: the letters, as they are and otherwise, any glyph file, and many random strokes."""
+"""Sets of glyphs to judge learners by: the letters, unchanged and changed, any glyph file, and random strokes."""
 
 import json
 import math
@@ -28,7 +28,7 @@ _SEED = 2_000_003
 
 
 def read_glyphs(path: Path) -> list[StrokeGoal]:
-    """The glyphs of a JSON file: names, each with straight strokes [x0, y0, x1, y1] in the unit square, y up.
+    """Reads the glyphs of a JSON file: names, each with straight strokes [x0, y0, x1, y1] in the unit square, y up.
 
     Raises:
       ValueError: names the file or the glyph, and what is wrong.
@@ -48,7 +48,7 @@ def read_glyphs(path: Path) -> list[StrokeGoal]:
 
 
 def _moved(scale: float, shift: float) -> list[StrokeGoal]:
-    """Letters made smaller or larger, and moved as far as `shift` (of the square) in a random direction each."""
+    """Letters scaled, and moved by up to `shift` (of the square) in a random direction each."""
     rng = np.random.default_rng(_SEED)
     out = []
     for name in string.ascii_uppercase:
@@ -60,12 +60,13 @@ def _moved(scale: float, shift: float) -> list[StrokeGoal]:
 
 
 def _pushed_by(blade: Blade, degrees: float = 29.0) -> list[StrokeGoal]:
+    """Letters pushed by another blade, or in sand of another angle of repose."""
     scene: Scene = make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(degrees), tool=blade)
     return [stroke_goal(name, task.place(goals.letter_strokes(name)), scene=scene) for name in string.ascii_uppercase]
 
 
 def _many() -> list[StrokeGoal]:
-    """26 goals of six to eight random strokes, made as the lessons' are."""
+    """26 goals of six to eight random strokes, drawn as those of training are."""
     strokes, numbers = random_plans(np.random.default_rng(_SEED), 200)
     some = np.flatnonzero(numbers >= 6)[:26]
     return [stroke_goal(f"{numbers[k]} strokes, {i}", strokes[k, : numbers[k]]) for i, k in enumerate(some, 1)]

@@ -1,23 +1,22 @@
-"""Probe environments: each asks one thing of a learner, and the values of all its states and actions are known.
+"""Probe environments: each tests one ability of a learner, and the values of all its states and actions are known.
 
-The idea is Andy Jones's ("Debugging RL without the agonizing pain"); they show what is broken before sand does. What an
-agent learns of a probe that does not hold its value lies in one part: the critic, its discount, or the choice of actions.
+The idea is Andy Jones's ("Debugging RL without the agonizing pain"): they show what is broken before a learner meets sand.
+If an agent fails on a probe, the fault lies in one part: the critic, its discount, or the choice of actions.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxsand.envs import episode
-from jaxsand.envs.episode import Step
+from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.spaces import Box, Discrete
 
 
 @dataclass(frozen=True)
 class Two:
-    """Actions 0 and 1: a reward of 1 for the one whose sign is wanted (0: negative), of -1 for the other."""
+    """Actions 0 and 1: the reward is 1 for the wanted one (0 for a negative sign), and -1 for the other."""
 
     space = Discrete(2)
 
@@ -30,7 +29,7 @@ class Two:
 
 @dataclass(frozen=True)
 class Line:
-    """An action [1] from -1 to 1: a reward of 1 - (action - wanted / 2)^2."""
+    """An action [1] from -1 to 1, whose reward is 1 - (action - wanted / 2)^2."""
 
     space = Box(-1.0, 1.0, (1,))
 
@@ -47,7 +46,7 @@ Actions = Two | Line
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ProbeState:
-    """The `sign` that is shown, -1, 0 or 1, and the `time`."""
+    """The state of a probe: the `sign` that is shown, -1, 0 or 1, and the `time`."""
 
     sign: jax.Array
     time: jax.Array
@@ -55,7 +54,7 @@ class ProbeState:
 
 @dataclass(frozen=True)
 class Constant:
-    """Whatever is done, the reward is 1: does the critic learn at all?"""
+    """The reward is 1 whatever is done: does the critic learn at all?"""
 
     steps, shows = 1, False
 
@@ -65,7 +64,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class ByObservation:
-    """The reward is the sign that is shown: does the critic look?"""
+    """The reward is the sign that is shown: does the critic see the observation?"""
 
     steps, shows = 1, True
 
@@ -85,7 +84,7 @@ class Late:
 
 @dataclass(frozen=True)
 class ByAction:
-    """A positive action is wanted: does the policy follow the critic?"""
+    """The reward is for a positive action: does the policy follow the critic?"""
 
     steps, shows = 1, False
 
@@ -95,7 +94,7 @@ class ByAction:
 
 @dataclass(frozen=True)
 class ByBoth:
-    """An action of the sign that is shown is wanted: does the policy look?"""
+    """The reward is for an action of the sign that is shown: does the policy see the observation?"""
 
     steps, shows = 1, True
 
@@ -108,8 +107,12 @@ Question = Constant | ByObservation | Late | ByAction | ByBoth
 
 @dataclass(frozen=True)
 class Probe:
-    """A question asked with one kind of actions. The observation [2] is the sign that is shown and the time; an episode
-    terminates after the question's steps. It has no parameters: `params` is None."""
+    """A question asked with one kind of actions.
+
+    The observation [2] is the sign that is shown and the time. An episode terminates after the question's steps. There are
+    no
+    parameters: `params` is None.
+    """
 
     question: Question
     actions: Actions
@@ -119,8 +122,8 @@ class Probe:
         state = ProbeState(sign, jnp.int32(0))
         return self.observe(state), state
 
-    def step_env(self, key: jax.Array, state: ProbeState, action: Any, params: None) -> Step:
-        reward = self.question.reward(self.actions, state, action)
+    def step_env(self, key: jax.Array, state: ProbeState, action: Action, params: None) -> Step[jax.Array, ProbeState]:
+        reward = self.question.reward(self.actions, state, jnp.asarray(action))
         new = ProbeState(state.sign, state.time + 1)
         return self.observe(new), new, reward, new.time >= self.question.steps, jnp.zeros((), bool), {}
 
@@ -141,13 +144,13 @@ class Probe:
         return [ProbeState(jnp.float32(s), jnp.int32(t)) for s in signs for t in range(self.question.steps)]
 
     def value(self, state: ProbeState, action: jax.Array, discount: float) -> float:
-        """Q(state, action) = reward + discount x the value of the next state, of the best policy."""
+        """The value of an action under the best policy: reward + discount x the value of the next state."""
         now = float(self.question.reward(self.actions, state, action))
         new = ProbeState(state.sign, state.time + 1)
         return now if new.time >= self.question.steps else now + discount * self.value(new, self.best(new), discount)
 
     def best(self, state: ProbeState) -> jax.Array:
-        """The best action; any is where none is better."""
+        """The best action; any action where none is better."""
         return self.actions.best(state.sign if self.question.shows else jnp.float32(1))
 
 

@@ -1,4 +1,4 @@
-"""How many glyphs a learner gets right: by itself, by looking ahead with the simulator, and after polish by gradients."""
+"""How many glyphs a policy gets right: alone, with look-ahead by the simulator, and after refinement by gradients."""
 
 import time
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,12 @@ if TYPE_CHECKING:
 
 
 def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = quiet) -> dict[str, Any]:
-    """As many pushes as each glyph has strokes, judged at the end; see `jaxsand.success`."""
+    """Lets a policy push as often as each glyph has strokes, and judges the result (see `jaxsand.goals.layout`).
+
+    Returns:
+      How many glyphs are `right` and `strict`, how many there are (`total`), how many have at least one right stroke
+      (`stroke_right`), the figures of each by name (`glyphs`), and the `seconds`.
+    """
     began = time.perf_counter()
     rows = {}
     for number, glyph in enumerate(glyphs, 1):
@@ -36,7 +41,7 @@ def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: T
 
 
 def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:
-    """The figures of one glyph after these pushes [M, 4] (m)."""
+    """The figures of one glyph after the pushes [M, 4] (m)."""
     after = glyph.sand.maps(pushes[None])[0] if len(pushes) else glyph.start
     goal, dug = glyph.goal - glyph.start, after - glyph.start
     level = np.zeros_like(goal)

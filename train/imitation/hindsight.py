@@ -1,14 +1,16 @@
-"""Hindsight imitation: a network that is shown a goal which random strokes made, and sand on the way there, learns which
-strokes are still to come.
+"""Hindsight imitation: a network sees a goal that random strokes made, and sand on the way there, and learns which strokes
+are still to come.
 
 Hindsight makes every plan of random strokes a success to learn from (goal-conditioned supervised learning, Ghosh et al.
-2019), and no reward is needed. With s the starts and e the ends of the n strokes due, all as good as each other,
+2019), and no reward is needed. With s the starts and e the ends of the n strokes that are still to come, all equally
+good,
 
-    loss = -1/n sum_r [log p(s_r) + log p(e_r | s_r)] + the losses of pairs of ends: a logistic one (is such a stroke due or
-           not) and Huber's of the ends of one that is.
+    loss = -1/n sum_r [log p(s_r) + log p(e_r | s_r)] + the losses of pairs of ends: a logistic one (is such a stroke
+    still to
+           come or not) and Huber's of the ends of one that is.
 
-From some time on every second chunk holds lessons on the way of its own strokes too (as in DAgger, Ross et al. 2011), so
-that it learns to go on from its mistakes. No letter is ever seen.
+After some chunks, every second chunk also holds lessons on the way of the network's own strokes (as in DAgger, Ross et
+al. 2011), so that it learns to go on from its mistakes. It never sees a letter.
 """
 
 from dataclasses import dataclass
@@ -24,13 +26,14 @@ from jaxsand.bench.stroke_goals import CELLS, SPACING, usual_scene
 from jaxsand.goals.layout import right, strokes_right
 from jaxsand.goals.metrics import iou
 from jaxsand.planning.learned.beam_search import one_after_the_other
-from jaxsand.planning.learned.network import StrokeNet, ends, judge, likeliest, spread
+from jaxsand.planning.learned.network import Params, StrokeNet, ends, judge, likeliest, spread
 from jaxsand.planning.learned.policy import Policy, in_batches
 from jaxsand.scene.scene import Scene, blade_of
 from train.imitation.lessons import Lessons, lessons, way
 from train.imitation.plans import MOST, random_plans
 from train.imitation.sand import other_scene, starts
 
+_Learned = tuple[Params, Params, optax.OptState]  # parameters, their moving average, the optimiser's state
 _WEIGHT = 2.0  # of the loss of pairs: are they due
 _ENDS = 4.0  # and how far are their ends off (cells)
 _HUBER = 0.05  # cells
@@ -42,20 +45,25 @@ _TRIALS = 64  # such goals
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Progress:
-    """The network's `params`, their moving `average` (which acts), the optimiser's state, and the chunks done."""
+    """The state of a run: the network's parameters, their moving average (which acts), the optimiser's state, chunks done,
+    the seed.
+    """
 
-    params: Any
-    average: Any
-    optimiser: Any
+    params: Params
+    average: Params
+    optimiser: optax.OptState
     chunk: jax.Array
     seed: jax.Array
 
 
 @dataclass(frozen=True)
 class Hindsight:
-    """See the module. `plans` of random strokes make a chunk of lessons, taken `batch` at a time; from the chunk `own` on
-    every other chunk goes its own way. A share `rough` of the plans starts on rough sand, and every so many chunks, one in
-    `other`, is of another blade and another angle of repose."""
+    """The learner; see the module.
+
+    A chunk has lessons from `plans` plans of random strokes, taken `batch` at a time. From the chunk `own` on every second
+    chunk has lessons on the way of its own strokes. A share `rough` of the plans starts on rough sand, and one chunk in
+    `other` has another blade and another angle of repose.
+    """
 
     plans: int = 192
     batch: int = 16
@@ -83,7 +91,11 @@ class Hindsight:
         return Progress(params, params, _optimiser().init(params), jnp.int32(0), jnp.int32(seed))
 
     def advance(self, state: Progress) -> tuple[Progress, dict[str, float]]:
-        """A chunk of lessons. The metrics are the mean loss, how many lessons and pushes, and whether of its own way."""
+        """One chunk of lessons.
+
+        Returns:
+          The next state, and the metrics: the mean `loss`, how many `lessons` and `pushes`, and whether on its `own` way.
+        """
         chunk = int(state.chunk)
         rng = np.random.default_rng([int(state.seed), chunk])
         scene = other_scene(rng) if chunk % self.other == self.other - 1 else usual_scene()
@@ -100,8 +112,11 @@ class Hindsight:
         return Progress(*learned, state.chunk + 1, state.seed), {name: float(x) for name, x in figures.items()}
 
     def validate(self, state: Progress) -> dict[str, float]:
-        """What the policy alone makes of goals of random strokes set apart: the share that is `right`, the share of
-        `strokes` that are, the `iou`, and the mean of the three, `score`."""
+        """Judges the policy alone on goals of random strokes set apart.
+
+        Returns:
+          The share of goals that is `right`, the share of `strokes` that are, the `iou`, and the mean of the three, `score`.
+        """
         scene, strokes, numbers, goals = _set_apart()
         plans, maps = one_after_the_other(self.policy(state), scene, np.zeros_like(goals), goals, MOST)
         rows = [(strokes[k, :n], plans[k, :n], maps[n, k], goals[k]) for k, n in enumerate(numbers)]
@@ -111,13 +126,13 @@ class Hindsight:
         return {"score": (good + made + same) / 3, "right": good, "strokes": made, "iou": same}
 
     def policy(self, state: Progress) -> Policy:
-        """What acts."""
+        """The network with the averaged parameters."""
         return Policy(self.net, state.average)
 
 
 @cache
 def _set_apart() -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
-    """The scene, the strokes and their numbers, and the goals that they make of level sand."""
+    """The scene, the strokes and their numbers, and the goals that they make of level sand, for validation."""
     scene, rng = usual_scene(), np.random.default_rng(_SET_APART)
     strokes, numbers = random_plans(rng, _TRIALS)
     return scene, strokes, numbers, way(scene, starts(scene, rng, _TRIALS, 0.0), strokes, numbers)[0]
@@ -131,20 +146,20 @@ def _optimiser() -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(), optax.add_decayed_weights(1e-4))
 
 
-def _choose(net: StrokeNet, params: Any, depth: float, goal: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Its likeliest strokes [B, 4] (m) at a single look, as is enough to learn by."""
+def _choose(net: StrokeNet, params: Params, depth: float, goal: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """The likeliest strokes [B, 4] (m) from a single view of the maps, which is good enough to learn from."""
     (strokes,) = in_batches(partial(_act, net, params), goal / depth, current / depth, (64,))
     return strokes * SPACING
 
 
 @partial(jax.jit, static_argnames="net")
-def _act(net: StrokeNet, params: Any, goal: jax.Array, current: jax.Array) -> tuple[jax.Array]:
+def _act(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Array) -> tuple[jax.Array]:
     scores: Any = net.apply(params, goal, current, method="look")
     return (likeliest(judge(net, params), scores, 1)[0][:, 0],)
 
 
 def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: float) -> tuple[np.ndarray, ...]:
-    """Lessons in units of depth and cells, each mirrored and transposed at random."""
+    """Lessons in units of the blade's depth and of cells, each mirrored and transposed at random."""
     goal, current = (x[who] / depth for x in (lesson.goal, lesson.current))
     due = (lesson.due[who] / SPACING).reshape(len(who), -1, 2, 2)
     for axis in (0, 1):  # x, y
@@ -158,7 +173,7 @@ def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: f
 
 
 def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
-    """Pairs of ends [B, 7 R, 4] (cells) of strokes [B, R, 2, 2]: their own, turned round, mixed, and moved."""
+    """Pairs of ends [B, 7 R, 4] (cells) of strokes [B, R, 2, 2]: the strokes' own, reversed, mixed, and moved."""
     batch, count = due.shape[:2]
     a, b, c, d = jax.random.split(key, 4)
     every = due.reshape(batch, 2 * count, 2)
@@ -181,8 +196,13 @@ def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Labels:
-    """Whether pairs [B, P] are strokes that are `due`, as numbers, whether that is `clear`, and the `strokes` [B, P, 4]
-    (cells) due that they are nearest to."""
+    """What is known of pairs of ends.
+
+    Attributes:
+      due: [B, P] 1 where the pair is a stroke that is still to come, else 0.
+      clear: [B, P] 1 where `due` is beyond doubt, else 0.
+      strokes: [B, P, 4] (cells) the nearest stroke to come.
+    """
 
     due: jax.Array
     clear: jax.Array
@@ -190,7 +210,7 @@ class Labels:
 
 
 def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> Labels:
-    """Of pairs [B, P, 4], for strokes [B, R, 2, 2] of which those `counts` [B, R] are due."""
+    """Labels of pairs [B, P, 4] for strokes [B, R, 2, 2], of which those with `counts` [B, R] are still to come."""
     strokes = due.reshape(*due.shape[:2], 4)
     every = jnp.max(jnp.abs(pairs[:, :, None] - strokes[:, None]), -1)
     every = jnp.where(counts[:, None] > 0, every, jnp.inf)
@@ -203,20 +223,20 @@ def _labels(pairs: jax.Array, due: jax.Array, counts: jax.Array) -> Labels:
 @partial(jax.jit, static_argnames="learner")
 def _learn(
     learner: Hindsight,
-    learned: Any,
+    learned: _Learned,
     chunk: int,
     key: int,
     goal: jax.Array,
     current: jax.Array,
     due: jax.Array,
     counts: jax.Array,
-) -> tuple[Any, jax.Array]:
-    """A step of gradient descent on a batch: the new parameters, average and optimiser's state, and the loss."""
+) -> tuple[_Learned, jax.Array]:
+    """One step of gradient descent on a batch: the new parameters, their average and the optimiser's state, and the loss."""
     params, average, state = learned
     pairs = _pairs(jax.random.key(key), due)
     label = _labels(pairs, due, counts)
 
-    def loss(params: Any) -> jax.Array:
+    def loss(params: Params) -> jax.Array:
         made: Any = learner.net.apply(params, goal, current, pairs)
         scores, lines = made
         share = counts / jnp.sum(counts, 1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What hindsight teaches: sand part of the way to a goal that strokes made, and which of those strokes are still to come."""
+"""Lessons for hindsight imitation: sand part of the way to a goal that strokes made, and which strokes are still to come."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,8 +18,14 @@ _ASTRAY = 0.05  # a stroke farther (m) than this from each that is due was none 
 
 @dataclass(frozen=True)
 class Lessons:
-    """`goal` and `current` maps [S, H, W] (m), and the strokes `due` [S, MOST, 4] (m), of which those `counts` [S, MOST];
-    and how many `pushes` of the simulator they took at most."""
+    """A chunk's lessons.
+
+    Attributes:
+      goal, current: maps [S, H, W] (m).
+      due: strokes [S, MOST, 4] (m).
+      counts: [S, MOST] which of these are still to come.
+      pushes: an upper bound of the pushes that were simulated.
+    """
 
     goal: np.ndarray
     current: np.ndarray
@@ -29,9 +35,17 @@ class Lessons:
 
 
 def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarray, choose: Choose | None = None) -> Lessons:
-    """Two ways to each goal: the one that made it, and one in another order and a little wrong; or, given `choose`, its own.
+    """Makes lessons from random plans, on two ways to each goal.
 
-    `start` [P, H, W] (m) are the maps at rest before the first strokes.
+    The first way is the one that made the goal. The second has the strokes in another order and a little wrong; or, given
+    `choose`, it has the strokes that `choose` picks.
+
+    Args:
+      scene: grid, sand and blade.
+      rng: draws the plans.
+      plans: how many, P.
+      start: maps [P, H, W] (m) at rest before the first strokes.
+      choose: picks strokes for goals and current maps.
     """
     strokes, numbers = random_plans(rng, plans)
     strokes = anywhere(rng, strokes)
@@ -57,7 +71,11 @@ def lessons(scene: Scene, rng: np.random.Generator, plans: int, start: np.ndarra
 
 
 def way(scene: Scene, start: np.ndarray, strokes: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The maps [P, H, W] (m) that as many strokes of plans [P, MOST, 4] (m) leave, and those before each [MOST, P, H, W]."""
+    """Pushes the strokes of plans [P, MOST, 4] (m), of which the first `numbers` [P] count.
+
+    Returns:
+      The maps [P, H, W] (m) that they leave, and the maps before each stroke [MOST, P, H, W].
+    """
     maps, every = [start], np.arange(len(start))
     for k in range(MOST):
         here = every[numbers > k]
@@ -70,7 +88,12 @@ def way(scene: Scene, start: np.ndarray, strokes: np.ndarray, numbers: np.ndarra
 def _own_way(
     scene: Scene, start: np.ndarray, strokes: np.ndarray, numbers: np.ndarray, goal: np.ndarray, choose: Choose
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The order in which strokes that `choose` gives come nearest to those due, and the maps before each (NaN: astray)."""
+    """Pushes the strokes that `choose` picks, and matches each with the nearest stroke of the plan that is still to come.
+
+    Returns:
+      The order [P, MOST] in which the plan's strokes were matched, and the maps before each push; NaN after a stroke that is
+      near none of them.
+    """
     maps, every = [start], np.arange(len(start))
     order = np.tile(np.arange(MOST), (len(start), 1))
     for k in range(MOST):

@@ -1,4 +1,4 @@
-"""Random plans of strokes on the square that glyphs fill; what the learners' goals are made of."""
+"""Random plans of strokes on the square in which glyphs lie; the learners' goals are made of them."""
 
 import numpy as np
 
@@ -16,10 +16,13 @@ _EDGE = 0.01  # m, from the map's border to a moved square
 
 
 def random_plans(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Strokes [P, MOST, 4] = x0, y0, x1, y1 (m) and how many of them [P] each plan has; the others are repeated ones.
+    """Draws plans.
 
-    A stroke starts anywhere, or where an earlier one starts or ends, or on its way, and ends anywhere, or there, or straight
-    across or along.
+    A stroke starts anywhere, or at an end of an earlier stroke, or on its way. It ends at such a place too, or straight
+    across or along from its start.
+
+    Returns:
+      Strokes [P, MOST, 4] = x0, y0, x1, y1 (m), and how many of them [P] count in each plan.
     """
     numbers = 1 + rng.choice(MOST, count, p=_COUNTS / _COUNTS.sum())
     strokes = np.zeros((count, MOST, 4))
@@ -31,7 +34,7 @@ def random_plans(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.n
 
 
 def anywhere(rng: np.random.Generator, plans: np.ndarray) -> np.ndarray:
-    """Half of these plans made smaller or a little larger, and put anywhere on the map."""
+    """The plans, half of them made smaller or a little larger and moved to a random place on the map."""
     low, high = GLYPH_SQUARE
     shape = (len(plans), 1, 1)
     scale = rng.uniform(*_SCALES, shape)
@@ -42,7 +45,7 @@ def anywhere(rng: np.random.Generator, plans: np.ndarray) -> np.ndarray:
 
 
 def _one_more(rng: np.random.Generator, earlier: np.ndarray) -> np.ndarray:
-    """A stroke [P, 4] of the unit square, the longest enough of a few."""
+    """A stroke [P, 4] of the unit square for each plan: the first of a few that is long enough."""
     count = len(earlier)
     a, b = _point(rng, earlier, (_TRIES, count)), _point(rng, earlier, (_TRIES, count))
     straight = rng.random((_TRIES, count)) < 0.35
@@ -56,7 +59,7 @@ def _one_more(rng: np.random.Generator, earlier: np.ndarray) -> np.ndarray:
 
 
 def _point(rng: np.random.Generator, earlier: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Points [T, P, 2]: anywhere, or at an end of an earlier stroke, or on its way."""
+    """Random points [T, P, 2]: anywhere, or at an end of an earlier stroke, or on its way."""
     anywhere = rng.random((*shape, 2))
     if not earlier.shape[1]:
         return anywhere

@@ -1,4 +1,4 @@
-"""The sand that learners practise on: level or rough, the default blade on it or another one."""
+"""The sand that learners practise on: level or rough, with the default blade or another one."""
 
 import math
 
@@ -21,7 +21,10 @@ def other_scene(rng: np.random.Generator) -> Scene:
 
 
 def starts(scene: Scene, rng: np.random.Generator, count: int, rough: float) -> np.ndarray:
-    """Maps [P, H, W] (m) at rest: a share of them `rough`, by smoothed noise of a range up to 15 mm; the others level."""
+    """Maps [P, H, W] (m) at rest.
+
+    About a share `rough` of them has smoothed noise with a range of up to 15 mm; the others are level.
+    """
     maps = np.zeros((count, *scene.grid.shape), np.float32)
     some = rng.random(count) < rough
     if not some.any():

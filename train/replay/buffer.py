@@ -1,4 +1,4 @@
-"""What learners remember: a ring of items of one shape, drawn from at random, any of them as likely."""
+"""A replay buffer: a ring of items of one shape, drawn from at random with equal chances."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,22 +12,22 @@ Items = Any
 
 @dataclass(frozen=True)
 class Buffer:
-    """The last `capacity` items, of which `batch` are drawn at a time, with replacement. Its state is a pytree."""
+    """Keeps the last `capacity` items, of which `batch` are drawn at a time, with replacement. Its state is a pytree."""
 
     capacity: int
     batch: int
 
     def init(self, item: Items) -> Any:
-        """The state without items; `item` shows their shapes and types."""
+        """The empty state; `item` shows the items' shapes and types."""
         return self._ring().init(item)
 
     def add(self, state: Any, items: Items) -> Any:
-        """Items [N, ...], N at most the capacity; the oldest make room."""
+        """Adds items [N, ...], N at most the capacity, in place of the oldest."""
         with jax.numpy_rank_promotion("allow"):  # as flashbax is written
             return self._ring().add(state, items)
 
     def sample(self, state: Any, key: jax.Array) -> Items:
-        """Items [batch, ...]; there must be one."""
+        """Draws items [batch, ...]; the buffer must hold at least one."""
         with jax.numpy_rank_promotion("allow"):
             return self._ring().sample(state, key).experience
 

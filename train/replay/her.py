@@ -1,7 +1,7 @@
-"""Hindsight experience replay: a step is learned from once more as if what came of the episode had been its goal.
+"""Hindsight experience replay: a step is learned from again as if the result of its episode had been the goal.
 
-Andrychowicz et al. 2017 (arXiv:1707.01495), strategies "final" and "future". It only needs that an observation is a
-dictionary with a `goal` and, of the same kind, what there is of it: `current`.
+Andrychowicz et al. 2017 (arXiv:1707.01495), strategies "final" and "future". It only needs observations that are
+dictionaries with a `goal` and, of the same kind, the `current` state of what the goal is about.
 """
 
 from collections.abc import Callable
@@ -18,9 +18,16 @@ Judge = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Steps:
-    """Steps of one environment in a row, every leaf [T, ...]: the `observation` and the one `after`, which is never that of
-    the next episode; the `action`, the `reward`, whether the episode was `terminated`, and whether it `ended` (terminated or
-    truncated) with this step."""
+    """Consecutive steps of one environment, every leaf [T, ...].
+
+    Attributes:
+      observation: before the step.
+      action: what was done.
+      reward: of the step.
+      terminated: whether the episode terminated with the step.
+      after: the observation after the step, never that of the next episode.
+      ended: whether the episode terminated or was truncated with the step.
+    """
 
     observation: Any
     action: jax.Array
@@ -32,33 +39,36 @@ class Steps:
 
 @dataclass(frozen=True)
 class Own:
-    """The neutral strategy: every step keeps its goal, and nothing is computed."""
+    """No hindsight: every step keeps its goal."""
 
     copies = 0
 
     def outcome(self, key: jax.Array, last: jax.Array) -> jax.Array:
+        """The steps [T] whose results become the goals; not used."""
         return last
 
 
 @dataclass(frozen=True)
 class Final:
-    """The goal is what there was at the episode's end."""
+    """The goal in hindsight is the result of the episode."""
 
     copies = 1
 
     def outcome(self, key: jax.Array, last: jax.Array) -> jax.Array:
-        """The steps [T] whose outcomes become the goals of steps [T] whose episodes' `last` steps are given."""
+        """For steps [T] whose episodes' last steps are `last` [T], the steps [T] whose results become the goals."""
         return last
 
 
 @dataclass(frozen=True)
 class Future:
-    """The goal is what there was after this or a later step of the episode, each as likely; so many `copies` to a goal."""
+    """The goal in hindsight is the result of this or a later step of the episode, with equal chances; `copies` to one own
+    goal.
+    """
 
     copies: int = 4
 
     def outcome(self, key: jax.Array, last: jax.Array) -> jax.Array:
-        """The steps [T] whose outcomes become the goals of steps [T] whose episodes' `last` steps are given."""
+        """For steps [T] whose episodes' last steps are `last` [T], the steps [T] whose results become the goals."""
         return jax.random.randint(key, last.shape, jnp.arange(len(last)), last + 1)
 
 
@@ -66,16 +76,16 @@ Strategy = Own | Final | Future
 
 
 def last_steps(ended: jax.Array) -> jax.Array:
-    """The index [T] of the last step of each step's episode; of one that goes on beyond the row, the row's last step."""
+    """The index [T] of the last step of each step's episode; the row's last step where the episode goes on beyond it."""
     count = len(ended)
     here = jnp.where(ended, jnp.arange(count), count - 1)
     return jax.lax.cummin(here, reverse=True)
 
 
 def relabel(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> Steps:
-    """The same steps [T], each with a goal in hindsight, and with the reward and the end that `judge` gives for it.
+    """The same steps [T] with goals in hindsight, and with the reward and the end that `judge` gives for these.
 
-    `ended` stays: the episode did not go on. For a batch of rows use jax.vmap; for more copies, other keys.
+    `ended` is unchanged, since the episode did end there. For a batch of rows use jax.vmap; for more copies, other keys.
 
     Raises:
       ValueError: for observations without a goal.
@@ -96,7 +106,7 @@ def relabel(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> S
 
 
 def mixed(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> Steps:
-    """The same steps [T], of which one in 1 + `copies`, chosen by chance, keeps its goal, and the others are relabelled."""
+    """The same steps [T], of which one in 1 + `copies`, chosen at random, keeps its goal, and the others are relabelled."""
     if not strategy.copies:
         return steps
     choose, draw = jax.random.split(key)
@@ -105,5 +115,5 @@ def mixed(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> Ste
 
 
 def chosen(which: jax.Array, one: Steps, other: Steps) -> Steps:
-    """Along their first axis, those of `one` where `which` [N] is true, and those of the `other`."""
+    """Along the first axis, the steps of `one` where `which` [N] is true, else those of `other`."""
     return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *(1,) * (a.ndim - 1)), a, b), one, other)

@@ -1,7 +1,8 @@
-"""What a run leaves in its folder, so that it can be read back: states as files of plain arrays, learners as JSON.
+"""Files of a run: states as files of plain arrays, learners as JSON.
 
-A checkpoint is one file: a single rename puts it in place whole, which a folder's checkpoint (Orbax) cannot promise, and it
-needs no import. It is written beside, brought to the disk, then renamed, so that a kill leaves the one before.
+A checkpoint is one file, so that a single rename puts it in place as a whole, which a folder's checkpoint (Orbax) cannot
+promise, and it needs no import. It is written beside the old one, flushed to the disk, then renamed, so that a kill leaves
+the old one.
 """
 
 import importlib
@@ -13,11 +14,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.lib.npyio import NpzFile
 
 State = Any
 """A pytree of arrays (typed keys too): parameters, optimiser, buffer, environments, key, counters; everything."""
@@ -29,8 +31,14 @@ _UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZi
 
 @dataclass(frozen=True)
 class At:
-    """Where a run is: after `chunk` chunks and `seconds` of work, with the best `score` so far, and so many bytes of metrics
-    in `rows`."""
+    """Where a run is.
+
+    Attributes:
+      chunk: chunks done.
+      seconds: of work.
+      score: the best so far.
+      rows: bytes of metrics written.
+    """
 
     chunk: int = 0
     seconds: float = 0.0
@@ -39,10 +47,10 @@ class At:
 
 
 def save(path: Path, state: State, at: At) -> None:
-    """Puts a checkpoint in place of the one before, whole or not at all.
+    """Writes a checkpoint in place of the old one, as a whole or not at all.
 
     Raises:
-      ValueError: if it cannot be written; the one before stays.
+      ValueError: if it cannot be written; the old one stays.
     """
     arrays: dict[str, Any] = {name: np.asarray(_plain(leaf)) for name, leaf in _named(state).items()}
     arrays[_ABOUT] = np.array(json.dumps(asdict(at)))
@@ -60,10 +68,10 @@ def save(path: Path, state: State, at: At) -> None:
 
 
 def load(path: Path, like: State) -> tuple[State, At]:
-    """The state in a file, of the kind of `like`, and where the run was.
+    """Reads a state of the same structure as `like`, and where the run was.
 
     Raises:
-      ValueError: if it cannot be read, or holds something else.
+      ValueError: if the file cannot be read, or holds something else.
     """
     leaves = _named(like)
     with _opened(path) as data:
@@ -86,7 +94,8 @@ def where(path: Path) -> At:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Iterator[NpzFile]:
+    """Opens a checkpoint; raises ValueError with advice if that fails."""
     try:
         with path.open("rb") as file, np.load(file) as data:
             yield data
@@ -100,14 +109,14 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def unwritable(path: Path, error: OSError) -> ValueError:
-    """What to say when a file of a run cannot be written."""
+    """The error for a file of a run that cannot be written."""
     return ValueError(
         f"out: cannot write {path} ({error.strerror}); make room or choose another folder: what is there stays good"
     )
 
 
-def described(thing: Any) -> Any:
-    """A learner, or a part of it, as JSON: frozen dataclasses of numbers, texts, tuples and other such dataclasses."""
+def described(thing: object) -> Any:
+    """A learner, or a part of it, as JSON data: frozen dataclasses of numbers, texts, tuples and other such dataclasses."""
     if is_dataclass(thing):
         own = {f.name: described(getattr(thing, f.name)) for f in fields(thing) if f.init}
         return {"is": f"{type(thing).__module__}:{type(thing).__qualname__}"} | own
@@ -119,10 +128,10 @@ def described(thing: Any) -> Any:
 
 
 def restored(data: Any) -> Any:
-    """What `described` described.
+    """The inverse of `described`.
 
     Raises:
-      ValueError: if it names what is no dataclass of `train` or `jaxsand`, or has other fields.
+      ValueError: if the data name something that is no dataclass of `train` or `jaxsand`, or that has other fields.
     """
     if isinstance(data, list):
         return tuple(restored(x) for x in data)
@@ -143,23 +152,27 @@ def restored(data: Any) -> Any:
 
 
 def _named(state: State) -> dict[str, Any]:
+    """The leaves of a state by their path."""
     paths = jax.tree_util.tree_flatten_with_path(state)[0]
     return {_STATE + jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in paths}
 
 
-def _is_key(leaf: Any) -> bool:
+def _is_key(leaf: object) -> TypeGuard[jax.Array]:
     return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _plain(leaf: Any) -> Any:
+    """A leaf as an array: a JAX key as its numbers."""
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _like(leaf: Any, array: np.ndarray) -> Any:
+def _like(leaf: object, array: np.ndarray) -> jax.Array | np.ndarray:
+    """An array of a file as a leaf of the kind of `leaf`."""
     if _is_key(leaf):
         return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(leaf))
     return jnp.asarray(array) if isinstance(leaf, jax.Array) else array
 
 
-def _kind(array: Any) -> str:
+def _kind(array: jax.Array | np.ndarray | None) -> str:
+    """Dtype and shape, for messages."""
     return "nothing" if array is None else f"{np.dtype(array.dtype).name}{list(array.shape)}"

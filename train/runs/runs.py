@@ -1,8 +1,8 @@
-"""Runs that survive: a learner advances chunk by chunk, and what a folder holds is enough to go on bit for bit.
+"""Runs that can be resumed: a learner advances chunk by chunk, and its folder holds enough to go on bit for bit.
 
 RUN/config.json    the learner, its fields, the seed, the versions
 RUN/metrics.jsonl  a row for every chunk, and one for every validation
-RUN/last.npz       where the run goes on
+RUN/last.npz       the state to go on from
 RUN/best.npz       the state that validated best
 """
 
@@ -33,15 +33,15 @@ _PACKAGES = ("jaxsand", "jax", "jaxlib", "numpy", "flax", "optax")
 
 
 class Learner(Protocol):
-    """A frozen dataclass whose fields are its configuration (numbers, texts, and tuples of them)."""
+    """A learner: a frozen dataclass whose fields (numbers, texts, and tuples of them) are its configuration."""
 
     @property
     def name(self) -> str:
-        """As the command line calls it."""
+        """Its name on the command line."""
 
     @property
     def every(self) -> int:
-        """Chunks from one validation to the next, by count; a run also validates where it ends."""
+        """How many chunks lie between validations; a run also validates at its end."""
 
     def init(self, seed: int) -> State:
         """The state before the first chunk."""
@@ -50,13 +50,21 @@ class Learner(Protocol):
         """One chunk of work (0.2 to 5 s). The next state is a pure function of this one."""
 
     def validate(self, state: State) -> Metrics:
-        """Figures on goals set apart, letters never among them. The larger its `score`, the better."""
+        """Figures on goals set apart, letters never among them; the larger their `score`, the better."""
 
 
 @dataclass(frozen=True)
 class Ran:
-    """What came of a run: the `state` after `chunk` chunks and `seconds` of work in all, the best `score` so far (-inf
-    before the first validation), whether it was asked to stop before its end, and how many chunks it `did` now."""
+    """What a run reached.
+
+    Attributes:
+      state: after the last chunk.
+      chunk: chunks done in all.
+      seconds: of work in all.
+      score: the best so far; -inf before the first validation.
+      stopped: whether it was asked to stop before its end.
+      did: chunks done by this call.
+    """
 
     state: State
     chunk: int
@@ -84,7 +92,14 @@ def run(
     validates best, at the end, and on SIGINT or SIGTERM, which let the chunk end first.
 
     Args:
-      watch: is given every row of the metrics.
+      learner: what is trained.
+      out: the run's folder.
+      seed: of everything drawn by chance.
+      minutes, steps: when to end; at least one is needed.
+      resume: whether to go on with the run in the folder.
+      save_every: seconds between checkpoints.
+      tell: is called with a line of progress.
+      watch: is called with every row of the metrics.
 
     Raises:
       ValueError: when neither end is given, a run is there without `resume`, none is there with it, it has another
@@ -155,7 +170,7 @@ def learner_of(out: Path) -> Learner:
     """The learner of the run in a folder, as it was configured.
 
     Raises:
-      ValueError: if there is no run, or none that this version can make.
+      ValueError: if there is no run, or this version cannot make its learner.
     """
     learner: Learner = restored(_config(out)["learner"])
     if not hasattr(learner, "advance"):
@@ -174,6 +189,7 @@ def seed_of(out: Path) -> int:
 
 
 def _config(out: Path) -> dict[str, Any]:
+    """The configuration of the run in a folder."""
     path = out / _CONFIG
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
@@ -206,15 +222,16 @@ def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State,
     return load_state(out / _LAST, state) if (out / _LAST).exists() else (state, At())
 
 
-def _compare(config: dict[str, Any], learner: Any, seed: int, out: Path) -> None:
-    """Whether a run goes on with what it began with."""
+def _compare(config: dict[str, Any], learner: object, seed: int, out: Path) -> None:
+    """Raises ValueError unless a run goes on with the configuration and the seed that it began with."""
     for field, have, want in _differences(config["learner"], learner, "learner"):
         raise ValueError(f"{field}: the run in {out} has {have}, got {want}; choose another folder, or give it the same")
     if config["seed"] != seed:
         raise ValueError(f"seed: the run in {out} has {config['seed']}, got {seed}; choose another folder, or give it that")
 
 
-def _differences(have: Any, want: Any, field: str) -> Iterator[tuple[str, Any, Any]]:
+def _differences(have: object, want: object, field: str) -> Iterator[tuple[str, object, object]]:
+    """The fields in which two configurations differ, with both values."""
     if isinstance(have, dict) and isinstance(want, dict):
         for name in dict.fromkeys([*have, *want]):
             yield from _differences(have.get(name), want.get(name), f"{field}.{name}")
@@ -224,7 +241,7 @@ def _differences(have: Any, want: Any, field: str) -> Iterator[tuple[str, Any, A
 
 @contextmanager
 def _rows(out: Path, size: int) -> Iterator[BinaryIO]:
-    """The file of metrics, cut to what the checkpoint knows of, to append to."""
+    """The file of metrics, opened to append, and cut to what the checkpoint knows of."""
     path = out / _METRICS
     try:
         with path.open("ab") as file:
@@ -247,7 +264,7 @@ def _append(rows: BinaryIO, out: Path, row: dict[str, Any]) -> None:
 
 @contextmanager
 def _asked_to_stop() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM; a second one does what it does elsewhere. Threads but the main one get none."""
+    """Collects SIGINT and SIGTERM; a second one acts as usual. Threads other than the main one receive none."""
     asked: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield asked
@@ -268,7 +285,7 @@ def _asked_to_stop() -> Iterator[list[int]]:
 
 
 def _to_go(chunk: int, rate: float, seconds: float, minutes: float | None, steps: int | None) -> float:
-    """The seconds of work to go, as things stand."""
+    """The seconds of work that are left at the present rate."""
     left = [60 * minutes - seconds] if minutes is not None else []
     return max(0.0, min(left + ([(steps - chunk) / rate] if steps is not None else [])))
 

@@ -1,14 +1,15 @@
 """Planning a single stroke: the shortest walk that digs every cell of a binary map and no other.
 
-The tool moves by one cell north, east, south or west and digs the cell it comes to. A cell dug by mistake cannot be mended,
-so the walk stays on the goal's cells (arXiv:1908.02745, "Single Stroke").
+The tool moves by one cell north, east, south or west and digs the cell that it comes to. A cell dug by mistake cannot be
+mended, so the walk stays on the goal's cells (arXiv:1908.02745, "Single Stroke").
 """
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxsand.planning.binary.anytime import anytime, nearest_first, simple_bound
 from jaxsand.planning.binary.astar import LARGEST, astar
@@ -26,8 +27,8 @@ _MOST = 1 << 27
 
 
 def plan(
-    dig: Any,
-    start: Any = None,
+    dig: ArrayLike,
+    start: ArrayLike | None = None,
     *,
     end: Cell | None = None,
     turn_cost: float = 0,
@@ -36,25 +37,40 @@ def plan(
     bound: int | None = None,
     seconds: float | None = None,
 ) -> Plan:
-    """The shortest walk over the true cells of `dig` [rows, columns] (row 0 on top).
+    """Finds the shortest walk that digs every cell of a binary map and no other.
+
+    The tool moves by one cell north, east, south or west. Cells count (row, column), row 0 on top; north goes up in the
+    text, which is +y on the sand.
 
     Args:
-      start: (row, column), or several such; without it, wherever is best.
-      end: where the walk must end; without it, anywhere.
+      dig: booleans [rows, columns], true where to dig; the true cells must hang together over their sides.
+      start: (row, column) of the first cell, or several to choose from; None lets the planner choose.
+      end: (row, column) of the last cell; None lets the planner choose.
       turn_cost: what a change of heading costs, in steps; a reversal is one change.
-      engine: `auto` proves the best with the sweeps of `exact`, or with A* where turns cost, as far as `bound` allows;
-        `exact` goes on until it is proven; `astar` is A* with a proven bound, dead ends pruned; `paper` the search of
-        arXiv:1908.02745; `anytime` improves a first walk until `seconds` are over; `frontier` is A* by whole layers on JAX's
-        device, for one start.
-      weight: by how much A* and the paper's search overrate what is left (1; above 1 is greedier and proves less; the
-        paper's alpha is 7.2 / weight).
-      bound: expansions after which the searches give up; for `exact` and `auto`, how many states are kept at a time. Where
-        none finds a walk it is one to the nearest cell first, and `optimal` is false unless the lower bound was met.
-      seconds: after which `anytime` stops, about (10); `auto` and `exact` with it are `anytime`.
+      engine: "auto" proves the best walk with the sweeps of "exact", or with A* where turns cost, as far as `bound` allows.
+        "exact" goes on until the walk is proven. "astar" is A* with a proven bound and dead ends pruned. "paper" is the
+        search of arXiv:1908.02745. "anytime" improves a first walk until `seconds` are over. "frontier" is A* by whole
+        layers on JAX's device, for one start.
+      weight: by how much A* and the paper's search overrate what is left; 1 if None. More is greedier and proves less; the
+        paper's alpha is 7.2 / weight.
+      bound: expansions after which a search gives up; for "exact" and "auto", how many states are kept at a time.
+      seconds: after which "anytime" stops, about; 10 if None. "auto" and "exact" with `seconds` are "anytime".
+
+    Returns:
+      A `Plan`. Where a search gives up without a walk, the walk goes to the nearest cell first, and `optimal` is false
+      unless its cost meets the lower bound.
 
     Raises:
       ValueError: for a map that is empty or falls into pieces (it names them), a start or an end that is not a cell to dig,
         or an option that the engine does not have.
+
+    Source: arXiv:1908.02745, section "Single Stroke", for the problem and the engine "paper".
+
+    Example:
+      >>> tee = np.array([[True, True, True], [False, True, False]])
+      >>> found = js.plan(tee, start=(0, 0))
+      >>> found.path, found.steps, found.optimal
+      ('EEWS', 4, True)
     """
     problem = make_problem(dig, start, end, turn_cost)
     _check(problem, engine, weight, bound, seconds)
@@ -87,7 +103,7 @@ def plan(
 
 
 def _layered(problem: Problem, bound: int | None) -> Found:
-    """The search by whole layers of planner/frontier.py, which runs on any device of JAX."""
+    """The engine "frontier", imported only when it is used."""
     from jaxsand.planning.binary.frontier import layered, two_colours
     from jaxsand.planning.binary.graph import MOST_CELLS, goal_only
 
@@ -102,6 +118,7 @@ def _layered(problem: Problem, bound: int | None) -> Found:
 
 
 def _check(problem: Problem, engine: str, weight: float | None, bound: int | None, seconds: float | None) -> None:
+    """Raises ValueError for an option that is wrong, or that the engine does not have."""
     engines = get_args(Engine)
     if engine not in engines:
         raise ValueError(f"engine: got {engine!r}; give one of {', '.join(engines)}")

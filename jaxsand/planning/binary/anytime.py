@@ -1,4 +1,4 @@
-"""A walk at once, a better one with time, and how far it can be from the best."""
+"""A walk at once, a shorter one with time, and a lower bound of the shortest."""
 
 import contextlib
 import time
@@ -14,16 +14,15 @@ from jaxsand.planning.binary.sweepline import OutOfTime
 
 _WIDTHS = (0, 1000, 16_384, 262_144)
 _WEIGHTS = (4.0, 2.0, 1.5, 1.2, 1.0)
-_LOOPY = 64  # cells of a block
 _LOOPY = 64  # cells of a block; smaller ones are proven before anything else pays
 _SPARE = 0.1  # of the time for making the first walk shorter
 
 
 def anytime(problem: Problem, seconds: float) -> Found:
-    """A greedy walk, made shorter; then wider and wider searches until one is proven best or the time is over.
+    """Makes a greedy walk shorter, then searches wider and wider until a walk is proven best or the time is over.
 
-    Where turns cost nothing these are sweeps with more and more states (exact.py); where they do, A* with lower and lower
-    weights follows. The lower bound is the best that any of them proved, up to where it was stopped.
+    Where turns cost nothing the searches are sweeps with more and more states (exact.py); where they do, A* with lower and
+    lower weights follows. The lower bound is the best that any of them proved, also by one that was stopped.
     """
     began = time.monotonic()
 
@@ -65,7 +64,7 @@ def anytime(problem: Problem, seconds: float) -> Found:
 
 
 def simple_bound(problem: Problem) -> int:
-    """Every step digs at most one cell, and goes to the other colour of the chessboard."""
+    """A lower bound of the steps: each digs at most one cell, and changes the colour of the chessboard."""
     board = problem.board
     dark = sum(board.colour)
     counts = (len(board.cells) - dark, dark)
@@ -78,8 +77,11 @@ def simple_bound(problem: Problem) -> int:
 
 
 def nearest_first(problem: Problem, tick: Callable[[], None] = lambda: None) -> list[int]:
-    """A walk that always goes on to the nearest cell to dig, into the smaller piece of what is left where several are as
-    near, and at last to the end. Once `tick` raises, any of the nearest will do."""
+    """A walk that always goes to the nearest cell to dig, and at last to the end.
+
+    Of several cells as near it takes the one in the smallest piece of what is left. Once `tick` raises, it takes any of
+    them.
+    """
     board = problem.board
     walk = [problem.starts[0]]
     left = set(range(len(board.cells))) - {walk[0]}
@@ -105,7 +107,10 @@ def nearest_first(problem: Problem, tick: Callable[[], None] = lambda: None) -> 
 
 
 def _into_the_smaller(board: Board, beside: list[int], left: set[int]) -> int:
-    """Of neighbours to dig the one in the smallest piece, then with the fewest neighbours; pieces count as far as 200."""
+    """The neighbour in the smallest piece of the cells left; among equals that with the fewest neighbours.
+
+    Pieces are measured up to 200 cells.
+    """
     size: dict[int, int] = {}
     for j in beside:
         if j in size:
@@ -124,7 +129,7 @@ def _into_the_smaller(board: Board, beside: list[int], left: set[int]) -> int:
 
 
 def _way(board: Board, start: int, targets: set[int]) -> list[int]:
-    """The shortest way to the nearest target, without the start; breadth first."""
+    """The shortest way to the nearest target, without the start."""
     came = {start: start}
     queue = [start]
     for here in queue:

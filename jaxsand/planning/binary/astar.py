@@ -17,11 +17,17 @@ _State = tuple[int, int, int]  # cell, cells left as bits, the cell before (-1 w
 
 
 def astar(problem: Problem, bound: int = 200_000, weight: float = 1.0, tick: Callable[[], None] = lambda: None) -> Found:
-    """Best first by f = g + weight h, with h from `block_bound`, which is admissible (see there).
+    """The walk of least cost by A*: best first by f = g + weight h, with the admissible h of `block_bound`.
 
-    Among equals the deepest first, then by the cells left; a state reached by a shorter way is opened again. With weight 1
-    the first walk found is a shortest one. Whenever the search stops, no walk costs less than the least g + h of what is
-    open. Gives up after `bound` expansions; `tick` is called now and then, and may raise to stop.
+    Among equal f the deepest states come first, then an order by the cells left. A state that is reached by a shorter way is
+    opened again. With weight 1 the first walk found is a shortest one. Whenever the search stops, no walk costs less than
+    the least g + h of the open states.
+
+    Args:
+      problem: board, starts, end and cost of turns.
+      bound: expansions after which it gives up.
+      weight: of h; more is greedier.
+      tick: is called at every expansion, and may raise to stop the search.
     """
     board = problem.board
     h = block_bound(board, problem.end)

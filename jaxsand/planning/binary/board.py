@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
@@ -16,7 +16,13 @@ _DEAREST = 10**6
 
 @dataclass(frozen=True)
 class Board:
-    """The cells to dig (row, column; row 0 on top) of a map of a `shape`, by number, and the neighbours of each."""
+    """A map as a graph.
+
+    Attributes:
+      shape: of the map.
+      cells: (row, column) of the cells to dig, row 0 on top; elsewhere a cell is its index here.
+      near: the neighbours of each cell.
+    """
 
     shape: tuple[int, int]
     cells: tuple[Cell, ...]
@@ -24,18 +30,18 @@ class Board:
 
     @cached_property
     def colour(self) -> tuple[int, ...]:
-        """0 or 1, as on a chessboard: every step goes to the other colour."""
+        """0 or 1 for each cell, as on a chessboard: every step goes to the other colour."""
         return tuple((r + c) % 2 for r, c in self.cells)
 
     @cached_property
     def masks(self) -> tuple[int, int]:
-        """The cells of each colour as bits."""
+        """The cells of each colour as bits of a whole number."""
         dark = sum(1 << i for i, own in enumerate(self.colour) if own)
         return (1 << len(self.cells)) - 1 & ~dark, dark
 
     @cached_property
     def steps(self) -> list[list[int]]:
-        """Steps between any two cells."""
+        """The fewest steps between any two cells."""
         n = len(self.cells)
         edges = np.array([(i, j) for i, nears in enumerate(self.near) for j in nears]).reshape(-1, 2)
         graph = csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
@@ -44,7 +50,7 @@ class Board:
 
 @dataclass(frozen=True)
 class Problem:
-    """A walk that digs every cell of a board: from one of `starts`, to `end` if that is given.
+    """A walk to find: it digs every cell of a board, begins at one of `starts`, and ends at `end` if that is given.
 
     Its cost is one for each step, and `turn_cost` for each change of heading (a reversal is one).
     """
@@ -55,8 +61,14 @@ class Problem:
     turn_cost: float = 0
 
 
-def make_problem(dig: Any, start: Any = None, end: Cell | None = None, turn_cost: float = 0) -> Problem:
-    """The problem of a map `dig` [rows, columns] of booleans; `start` is a cell, several cells, or None for any.
+def make_problem(dig: ArrayLike, start: ArrayLike | None = None, end: Cell | None = None, turn_cost: float = 0) -> Problem:
+    """Checks a user's map, start, end and turn cost, and makes the problem of them.
+
+    Args:
+      dig: booleans [rows, columns].
+      start: (row, column) of a cell, several of them, or None for any.
+      end: (row, column) of a cell, or None for any.
+      turn_cost: what a change of heading costs, in steps.
 
     Raises:
       ValueError: for a map that is empty or falls into pieces (it names them), a start or end that is not a cell to dig, or
@@ -92,7 +104,8 @@ def make_problem(dig: Any, start: Any = None, end: Cell | None = None, turn_cost
     return Problem(Board(dig.shape, tuple(cells), near), tuple(dict.fromkeys(chosen)), goal, float(turn_cost))
 
 
-def _several(field: str, start: Any) -> list[Cell]:
+def _several(field: str, start: ArrayLike) -> list[Cell]:
+    """A user's cell or cells as a list."""
     given = np.asarray(start)
     if given.ndim not in (1, 2) or given.shape[-1] != 2 or not given.size or given.dtype.kind not in "iu":
         raise ValueError(f"{field}: got {start!r}; give (row, column) of a cell to dig")
@@ -100,13 +113,14 @@ def _several(field: str, start: Any) -> list[Cell]:
 
 
 def _index(at: dict[Cell, int], field: str, cell: Cell) -> int:
+    """The number of a cell; raises ValueError if it is not to be dug."""
     if cell not in at:
         raise ValueError(f"{field}: got {cell}; give (row, column) of a cell to dig, such as {next(iter(at))}")
     return at[cell]
 
 
 def connected_pieces(dig: np.ndarray) -> list[set[Cell]]:
-    """The sets of true cells that hang together over their sides, largest first."""
+    """The connected sets of true cells (over their sides), largest first."""
     labels, count = label(dig)
     where = np.argwhere(labels)
     pieces: list[set[Cell]] = [set() for _ in range(count)]
@@ -117,7 +131,7 @@ def connected_pieces(dig: np.ndarray) -> list[set[Cell]]:
 
 @dataclass(frozen=True)
 class Block:
-    """A largest part of the graph that no single cell can cut, or a bridge (two cells)."""
+    """A block of the graph: a largest part that stays connected when any one cell is removed, or a bridge (two cells)."""
 
     cells: tuple[int, ...]
     edges: tuple[tuple[int, int], ...]
@@ -159,7 +173,13 @@ def blocks_of(near: tuple[tuple[int, ...], ...]) -> list[Block]:
 
 @dataclass(frozen=True)
 class Hanging:
-    """A block as it hangs from a root: `gate` is its cell towards the root, `below` its children by cell."""
+    """A block in the tree of blocks that hangs from a root.
+
+    Attributes:
+      block: the block.
+      gate: its cell towards the root.
+      below: for each cell with blocks below it, the cell and the places of these blocks in the list of `hang`.
+    """
 
     block: Block
     gate: int
@@ -167,7 +187,7 @@ class Hanging:
 
 
 def hang(blocks: list[Block], root: int) -> list[Hanging]:
-    """The block-cut tree hung from a cell, children before parents; `Hanging.below` holds places in this list."""
+    """The tree of blocks hung from a cell, children before parents."""
     of: dict[int, list[int]] = {}
     for b, block in enumerate(blocks):
         for v in block.cells:

@@ -1,4 +1,4 @@
-"""How many steps a walk still needs, at least: a bound from the block-cut tree, with its proof.
+"""A lower bound of the steps that a walk still needs, from the tree of the graph's blocks, with its proof.
 
 A walk from p over all cells of a set U, seen as the multigraph of the edges it uses, is connected, and only its two ends
 have odd degree. Let the blocks (2-connected parts and bridges) hang from p in their tree; let B be a block with cells of U
@@ -14,8 +14,8 @@ colour as g (every step changes colour), such a part takes at least
   v of the other colour makes L odd, so L >= max(2 k_o - 1, 2 k_s + 1); v of the same makes L >= 2 max(k_o, k_s). And L is
   at least the way from g to x and on to v.
 
-The open parts lie on one path down the tree, and if the walk is as short as can be, it ends on a cell of U, so that v is in
-R. The bound takes the path that saves most over closed parts; every term being a lower bound, so is their sum.
+The open parts lie on one path down the tree. If the walk is as short as can be, it ends on a cell of U, so that v is in R.
+The bound takes the path on which open parts save most over closed ones; every term being a lower bound, so is their sum.
 """
 
 from collections.abc import Callable
@@ -30,8 +30,17 @@ _NEVER = -(10**9)
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """A block below its gate: bits of its cells, of those of the other and the same colour as the gate, of all below it, of
-    those below each of its cells; and its cells by their distance from the gate, farthest first."""
+    """A block below its gate, its sets of cells as bits.
+
+    Attributes:
+      bridge: whether the block is a bridge.
+      at_root: whether its gate is the root.
+      own: its cells, without the gate.
+      other, same: those of the other colour than the gate, and of the same.
+      reach: its cells and all below them.
+      below: for each cell with blocks below it, the cell, all cells below it, and the places of these blocks.
+      rings: distance from the gate and the cells at that distance, farthest first.
+    """
 
     bridge: bool
     at_root: bool
@@ -44,7 +53,7 @@ class _Part:
 
 
 def block_bound(board: Board, end: int | None = None) -> Bound:
-    """The bound above, by the tool's cell and the cells left to dig (bits); with `end`, for walks that end there."""
+    """The bound as a function of the tool's cell and the cells left to dig (bits); with `end`, of walks that end there."""
     blocks = blocks_of(board.near)
     roots = max(16, 200_000 // len(board.cells))  # kept at a time: each takes as many bits as there are cells, squared
     parts = lru_cache(roots)(lambda root: _parts(board, hang(blocks, root), root))
@@ -80,13 +89,13 @@ def block_bound(board: Board, end: int | None = None) -> Bound:
 
 
 def _gain(bit: int, target: int, beyond: dict[int, int]) -> int:
-    """What is saved below a cell if the walk ends there or below; never, where a required end is elsewhere."""
+    """What is saved below a cell if the walk ends there or below it; `_NEVER` where a required end lies elsewhere."""
     below = beyond.get(bit, _NEVER)
     return below if target and bit != target else max(below, 0)
 
 
 def _block(board: Board, part: _Part, visit: int, target: int, beyond: dict[int, int]) -> tuple[int, int]:
-    """The bound of a closed part, and what an open one saves, with all below it."""
+    """The bound of a closed part, and what an open one saves over it, with all below it."""
     k_other, k_same = (visit & part.other).bit_count(), (visit & part.same).bit_count()
     way, ring = next(ring for ring in part.rings if ring[1] & visit)
     farthest = (ring & visit).bit_length() - 1
@@ -103,6 +112,7 @@ def _block(board: Board, part: _Part, visit: int, target: int, beyond: dict[int,
 
 
 def _parts(board: Board, hung: list[Hanging], root: int) -> tuple[_Part, ...]:
+    """The blocks hung from a root as `_Part`s, children before parents."""
     parts: list[_Part] = []
     for one in hung:
         block: Block = one.block

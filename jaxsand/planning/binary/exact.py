@@ -1,16 +1,17 @@
-"""The shortest walk over a map, proven: blocks apart, each by a sweep, put together along the block-cut tree.
+"""The shortest walk over a map, proven: blocks are solved one by one, each by a sweep, and joined along the tree of blocks.
 
 The walk is a connected multigraph in which only its two ends have odd degree (Euler 1736). In each block it is closed, or
 open from the block's gate to where the walk goes on or ends, or, where both ends lie in or below the block, open between two
-of its cells (bound.py says why blocks do not interfere). So per block, from the leaves of the tree up: the cheapest closed
-walk; what ending in or below it saves; what having both ends there saves. The tree hangs from the start, or, where any
-start will do, from any cell.
+of its cells (bound.py says why blocks do not interfere). So three figures are computed per block, from the leaves of the
+tree
+up: the cheapest closed walk; what it saves if one end lies in or below the block; what it saves if both do. The tree hangs
+from the start, or, where any start will do, from any cell.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
+from typing import TypeAlias
 
 from jaxsand.planning.binary.board import Block, Board, Hanging, Problem, blocks_of, hang
 from jaxsand.planning.binary.plans import Found
@@ -26,7 +27,15 @@ class _NothingFound(Exception):  # noqa: N818 - means that `width` was too small
 
 @dataclass
 class Blocks:
-    """A board's blocks, and the sweeps over them that are known already."""
+    """A board's blocks, and the sweeps over them that are known already.
+
+    Attributes:
+      board: the graph.
+      blocks: its blocks.
+      sweeps: the steps of the sweep over a block, by the number of its first edge.
+      known: the tours found, by block and ends.
+      states: how many states all searches expanded.
+    """
 
     board: Board
     blocks: list[Block] = field(init=False)
@@ -38,7 +47,9 @@ class Blocks:
         self.blocks = blocks_of(self.board.near)
 
     def tour(self, block: Block, ends: Ends, width: int, tick: Callable[[], None]) -> Tour:
-        """The cheapest walk over a block with these ends; what a former call proved is used again."""
+        """The cheapest walk over a block with these ends; uses what former calls proved. With a width of 0 only its lower
+        bound.
+        """
         number = block.edges[0][0] * len(self.board.cells) + block.edges[0][1]
         key = (number, ends.gate, ends.from_gate, ends.count, tuple(sorted(ends.gains.items())) if ends.count else ())
         old = self.known.get(key)
@@ -73,13 +84,20 @@ class _Swap:
     times: tuple[int, ...]
 
 
+_Swaps: TypeAlias = "_Swap | tuple[_Swaps, ...]"
+
+
 @dataclass(frozen=True)
 class _Saving:
-    """What it saves if one end of the walk, or both, lie at a cell or in blocks below it, against closed walks everywhere;
-    and the tours that take the place of closed ones, `_Swap`s in nested pairs."""
+    """What open walks save over closed ones if one end of the walk, or both, lie at a cell or in blocks below it.
+
+    Attributes:
+      value: the steps saved.
+      swaps: the tours that replace closed ones, `_Swap`s in nested pairs.
+    """
 
     value: int
-    swaps: Any = ()
+    swaps: _Swaps = ()
 
     def __add__(self, other: "_Saving") -> "_Saving":
         return _Saving(self.value + other.value, (self.swaps, other.swaps))
@@ -87,8 +105,14 @@ class _Saving:
 
 @dataclass(frozen=True)
 class _Part:
-    """A block with all below it: its closed tour, what one end and both ends there save (None: not possible), and how far
-    its figures may be from the truth."""
+    """A block with all below it.
+
+    Attributes:
+      closed: its closed tour.
+      cost: of that tour.
+      one, two: what one end and both ends in or below the block save; None where that is impossible.
+      slack: how far the costs may be above the true ones.
+    """
 
     closed: _Swap
     cost: int
@@ -98,11 +122,14 @@ class _Part:
 
 
 def exact(problem: Problem, width: int, tick: Callable[[], None] = lambda: None, blocks: Blocks | None = None) -> Found:
-    """The shortest walk over a board, where turns cost nothing; with at most `width` states at a time (see sweepline.py).
+    """The shortest walk over a board, where turns cost nothing.
 
-    With a width of 0 no walk is looked for: the lower bound is that of every block, without connection (relaxed.py).
-
-    `tick` is called now and then, and may raise `OutOfTime`. `blocks` keeps what is known from one call to the next.
+    Args:
+      problem: board, starts and end.
+      width: how many states of a sweep are kept at a time (see sweepline.py); with 0 no walk is sought, and the lower bound
+        is that of every block without connection (relaxed.py).
+      tick: is called now and then, and may raise `OutOfTime`.
+      blocks: keeps what is known from one call to the next.
     """
     blocks = blocks or Blocks(problem.board)
     n, before = len(problem.board.cells), blocks.states
@@ -123,7 +150,10 @@ def exact(problem: Problem, width: int, tick: Callable[[], None] = lambda: None,
 def _hung_from(
     root: int, blocks: Blocks, allowed: frozenset[int], ends: int, width: int, tick: Callable[[], None]
 ) -> tuple[list[int] | None, int]:
-    """The walk with its other end, or with both, in `allowed`, and a lower bound."""
+    """The walk from `root` with its other end, or from anywhere with both ends, in `allowed`; and a lower bound.
+
+    `ends` is 1 or 2: how many ends are free.
+    """
     least = len(blocks.board.cells) - 1
     parts: list[_Part] = []
     hung = hang(blocks.blocks, root)
@@ -168,6 +198,7 @@ def _part(
     width: int,
     tick: Callable[[], None],
 ) -> _Part:
+    """The figures of a block from those of the blocks below it."""
     block, gate = hanging.block, hanging.gate
     children = dict(hanging.below)
     at = {v: _at(v, [parts[k] for k in children.get(v, ())], allowed) for v in block.cells if v != gate}
@@ -199,6 +230,7 @@ def _part(
 
 
 def _odd(block: Block, times: tuple[int, ...]) -> set[int]:
+    """The cells whose degree in a tour is odd."""
     odd: set[int] = set()
     for (a, b), often in zip(block.edges, times, strict=False):
         if often % 2:
@@ -206,8 +238,10 @@ def _odd(block: Block, times: tuple[int, ...]) -> set[int]:
     return odd
 
 
-def _flat(swaps: Any) -> list[_Swap]:
-    found, stack = [], [swaps]
+def _flat(swaps: _Swaps) -> list[_Swap]:
+    """The `_Swap`s in nested pairs, as one list."""
+    found: list[_Swap] = []
+    stack = [swaps]
     while stack:
         one = stack.pop()
         if isinstance(one, _Swap):
@@ -218,7 +252,7 @@ def _flat(swaps: Any) -> list[_Swap]:
 
 
 def trail(times: dict[tuple[int, int], int], start: int) -> list[int]:
-    """A walk that takes every edge as often as said (Hierholzer 1873), from an odd cell if there is one."""
+    """A walk that takes every edge as often as `times` says (Hierholzer 1873), from an odd cell if there is one."""
     near: dict[int, list[int]] = {start: []}
     left: dict[tuple[int, int], int] = {}
     degree: dict[int, int] = {}

@@ -1,11 +1,11 @@
-"""A* by whole layers: thousands of states expanded, bounded and told apart in one compiled call.
+"""A* by whole layers: thousands of states are expanded, bounded and compared in one compiled call.
 
-A tool walks over a graph of cells and digs each cell it enters; the shortest walk that digs exactly the goal is sought
+A tool walks over a graph of cells and digs each cell that it enters; the shortest walk that digs exactly the goal is sought
 (arXiv:1908.02745, "Single Stroke"). A state is the tool's cell and the set of dug cells, held as bits. A step raises
 f = g + h by 0, 1 or 2, so no heap is needed: the states of one f lie in a stack on the host, a chunk of them goes to the
-device, and their children come back sorted by how much f rose. A table on the device remembers the states expanded; it may
-forget some, which costs time only: a state is dropped if, and only if, the very same one was taken up before, at the same f
-or a lower one, so with no more steps. Hence a goal taken up at f is reached in f steps, and in no fewer.
+device, and their children come back sorted by how much f rose. A table on the device remembers the states expanded. It may
+forget some, which costs only time: a state is dropped if, and only if, the very same one was expanded before, at the same f
+or a lower one, so with no more steps. Hence a goal that is taken up at f is reached in f steps, and in no fewer.
 """
 
 from collections.abc import Callable
@@ -28,10 +28,13 @@ Bound = Callable[[Graph, jax.Array, jax.Array], jax.Array]
 
 @dataclass(frozen=True)
 class Layered:
-    """What a search by layers found: a shortest walk, or None where it stopped at its limits.
+    """What a search by layers found.
 
-    `walk` lists the cells passed, the start included. No walk takes fewer than `lower_bound` steps. `expanded` counts the
-    states taken up, `opened` the neighbours looked at.
+    Attributes:
+      walk: the cells passed, the start included; None where the search stopped at its limits.
+      lower_bound: no walk takes fewer steps.
+      expanded: how many states were expanded.
+      opened: how many neighbours were looked at.
     """
 
     walk: tuple[int, ...] | None
@@ -49,7 +52,7 @@ class Layered:
 
 
 def misdug(graph: Graph, cell: jax.Array, dug: jax.Array) -> jax.Array:
-    """h = (goal cells not dug) + (other cells dug), the paper's estimate.
+    """h = (goal cells not dug) + (other cells dug) [n], the paper's estimate.
 
     A step digs one cell at most and mends none: f rises by 0 (a goal cell dug), 1 (nothing dug) or 2 (a wrong one).
     """
@@ -57,7 +60,7 @@ def misdug(graph: Graph, cell: jax.Array, dug: jax.Array) -> jax.Array:
 
 
 def two_colours(graph: Graph, cell: jax.Array, dug: jax.Array) -> jax.Array:
-    """h = max(2 o - 1, 2 s), where s and o goal cells are left of the tool's colour and of the other.
+    """h = max(2 o - 1, 2 s) [n], where s and o goal cells are left of the tool's colour and of the other.
 
     Admissible: colours alternate along a walk, so the cells of the other colour are entered at steps 1, 3, ..., 2 o - 1 at
     the earliest, those of the tool's at 2, 4, ..., 2 s. A step that digs leaves max(2 s - 1, 2 o - 2) = h - 1, so f stays;
@@ -73,11 +76,15 @@ def two_colours(graph: Graph, cell: jax.Array, dug: jax.Array) -> jax.Array:
 def layered(
     graph: Graph, bound: Bound, *, limit: int = 1 << 27, memory: int = 1 << 30, slots: int = 1 << 19, chunk: int = 1 << 13
 ) -> Layered:
-    """The shortest walk, proven, by A* over whole layers.
+    """The shortest walk over a graph, proven, by A* over whole layers.
 
-    It stops without a walk, but with a lower bound, after `limit` expansions, or once the states that wait take `memory`
-    bytes of the host. The device remembers `slots` states; a long search that forgets many expands some again. A call takes
-    up to `chunk` states: few dive to the goal sooner, many are taken up faster, on a GPU above all.
+    Args:
+      graph: cells, goal and start.
+      bound: the estimate h: admissible, and changed by at most 1 in a step.
+      limit: expansions after which it stops, with a lower bound but no walk.
+      memory: bytes of the host that waiting states may take before it stops.
+      slots: states that the device remembers; a long search that forgets many expands some again.
+      chunk: states that a call expands at most. Few reach the goal sooner; many are expanded faster, above all on a GPU.
 
     Raises:
       ValueError: for `limit`, `slots` or `chunk` out of range, and a bound that breaks its contract.
@@ -135,7 +142,7 @@ class _Stack:
             self.size += len(rows)
 
     def pop(self, rows: np.ndarray) -> int:
-        """Fill `rows` as far as there are states; how many."""
+        """Fills `rows` with states from the top, and returns how many there were."""
         got = 0
         while got < len(rows) and self.parts:
             part = self.parts.pop()
@@ -149,7 +156,7 @@ class _Stack:
 
 
 def _walk(graph: Graph, origins: np.ndarray, last: int) -> tuple[int, ...]:
-    """The cells from the start to the state expanded as number `last`."""
+    """The cells from the start to the state that was expanded as number `last`."""
     moves = []
     while last:
         moves.append(int(origins[last]) & 3)
@@ -162,12 +169,14 @@ def _walk(graph: Graph, origins: np.ndarray, last: int) -> tuple[int, ...]:
 
 @partial(jax.jit, static_argnames="bound", donate_argnames="table", compiler_options=_UNSPLIT)
 def _expand(table: jax.Array, graph: Graph, rows: jax.Array, *, bound: Bound) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The children of those of the states `rows` [n, words + 2] that are new, in order of the rise of f.
+    """The children of those states `rows` [n, words + 2] that are new, in order of the rise of f.
 
-    A row is the cell, the dug cells (none in a row to be left out), and where the state comes from: its parent's number,
-    here the row's, times 4 plus the move. `table` [slots, words + 1] holds rows without the last column.
-    Returns the table, the children [4 n, words + 2], and [6]: where those of each rise end, the row of the goal or -1, the
-    neighbours looked at, the new states.
+    A row holds the cell, the dug cells as bits (none in a row to be skipped), and where the state comes from: its parent's
+    number, here the row's, times 4 plus the move. `table` [slots, words + 1] holds rows without the last column.
+
+    Returns:
+      The table, the children [4 n, words + 2], and six counts: where the children of each rise end [3], the row of the goal
+      or -1, the neighbours looked at, the new states.
     """
     n, slots = len(rows), len(table)
     cell, dug, key = rows[:, 0].astype(jnp.int32), rows[:, 1:-1], rows[:, :-1]
@@ -200,6 +209,7 @@ def _expand(table: jax.Array, graph: Graph, rows: jax.Array, *, bound: Bound) ->
 
 
 def _count(words: jax.Array) -> jax.Array:
+    """The number of bits set in the words along the last axis."""
     return jnp.sum(jax.lax.population_count(words).astype(jnp.int32), axis=-1, dtype=jnp.int32)
 
 
@@ -213,7 +223,9 @@ def _hash(cell: jax.Array, dug: jax.Array) -> jax.Array:
 
 
 def _ranks(masks: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """How many true entries of masks [k, n] come before each, row after row [k, n], and up to each row's end [k]."""
+    """For every true entry of masks [k, n] how many come before it, row after row [k, n]; and how many up to each row's end
+    [k].
+    """
     lane = jnp.arange(32, dtype=jnp.uint32)[None]
     word = jnp.sum(masks.reshape(-1, 32).astype(jnp.uint32) << lane, axis=1, dtype=jnp.uint32)
     ends = jnp.cumsum(jax.lax.population_count(word).astype(jnp.int32), dtype=jnp.int32)

@@ -1,4 +1,4 @@
-"""A map as arrays, for searches on a device: who is whose neighbour, and cells as bits."""
+"""A map as arrays, for searches on a device: the neighbours of every cell, and sets of cells as bits."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -13,10 +13,13 @@ MOST_CELLS = 1 << 15
 @partial(jax.tree_util.register_dataclass, data_fields=("near", "goal", "odd", "start"), meta_fields=())
 @dataclass(frozen=True)
 class Graph:
-    """Cells in two colours, of which every step changes one for the other; cell i is bit i % 32 of word i // 32.
+    """Cells in two colours; every step goes from one colour to the other. Cell i is bit i % 32 of word i // 32.
 
-    near: [cells, 4] int32, the neighbours of each cell, -1 for none; goal: [words] uint32, the cells to dig;
-    odd: [words] uint32, the cells of one colour; start: the cell where the tool is, dug.
+    Attributes:
+      near: [cells, 4] int32, the neighbours of each cell, -1 for none.
+      goal: [words] uint32, the cells to dig.
+      odd: [words] uint32, the cells of one colour.
+      start: the cell where the tool stands, which counts as dug.
     """
 
     near: Any
@@ -54,7 +57,7 @@ def make_graph(near: np.ndarray, goal: np.ndarray, start: int) -> Graph:
 
 
 def _colours(near: np.ndarray, start: int, allowed: np.ndarray) -> np.ndarray:
-    """The colour, 0 or 1, of every cell to be reached over allowed ones; -1 of the others."""
+    """The colour, 0 or 1, of every cell that can be reached over allowed cells; -1 of the others."""
     colour = np.full(len(near), -1)
     colour[start] = 0
     queue = [start]
@@ -67,19 +70,20 @@ def _colours(near: np.ndarray, start: int, allowed: np.ndarray) -> np.ndarray:
 
 
 def _packed(mask: np.ndarray) -> np.ndarray:
+    """Booleans [cells] as bits."""
     bits = np.zeros(-(-len(mask) // 32) * 32, bool)
     bits[: len(mask)] = mask
     return np.packbits(bits, bitorder="little").view("<u4").astype(np.uint32)
 
 
 def with_margin(dig: np.ndarray, start: tuple[int, int], margin: int = 1) -> Graph:
-    """The paper's graph: every cell of the map and of a margin around it may be dug."""
+    """The paper's graph: every cell of the map, and of a margin around it, may be dug."""
     wide = np.pad(dig, margin)
     where = (start[0] + margin) * wide.shape[1] + start[1] + margin
     return make_graph(grid_near(np.ones_like(wide)), wide.reshape(-1), where)
 
 
 def goal_only(dig: np.ndarray, start: tuple[int, int]) -> Graph:
-    """Only the cells to dig: any other is a dead end. Cells are numbered row by row."""
+    """The graph of the cells to dig alone, numbered row by row; any other cell would be a dead end."""
     where = int(dig.reshape(-1)[: start[0] * dig.shape[1] + start[1]].sum())
     return make_graph(grid_near(dig), np.ones(dig.sum(), bool), where)

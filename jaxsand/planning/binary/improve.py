@@ -1,4 +1,4 @@
-"""A walk made shorter step by step, without a proof: cycles turned over, ends moved, double edges dropped."""
+"""Makes a walk shorter step by step, without a proof: turns cycles over, moves ends, drops double edges."""
 
 import contextlib
 from collections.abc import Callable
@@ -14,10 +14,10 @@ Edge = tuple[int, int]
 def improved(problem: Problem, walk: list[int], tick: Callable[[], None]) -> list[int]:
     """A walk over the same cells, no longer than `walk`, with the same ends unless the problem lets them move.
 
-    The walk is a connected multigraph (see exact.py). Turning a cycle over, so that its edges taken once are taken twice
-    and the others once, keeps every degree's parity, and so does dropping an edge taken twice; turning over the way from an
-    end to another cell moves the end there. That is done where the walk gets shorter, and stays in one piece, until no cycle
-    of a breadth-first basis and no way to a dead end helps, or `tick` raises.
+    The walk is a connected multigraph (see exact.py). To turn a cycle over is to take its edges once that were taken twice
+    or not at all, and the others twice; like dropping an edge taken twice, this keeps the parity of every degree. To turn
+    over the way from an end to another cell moves the end there. Both are done where the walk becomes shorter and stays
+    connected, until no cycle of a breadth-first basis and no way to a dead end helps, or `tick` raises.
     """
     board = problem.board
     times: dict[Edge, int] = {}
@@ -34,6 +34,7 @@ def improved(problem: Problem, walk: list[int], tick: Callable[[], None]) -> lis
 
 
 def _turn(board: Board, times: dict[Edge, int], ends: list[int], movable: list[int], tick: Callable[[], None]) -> None:
+    """Turns over cycles, and ways from the ends to dead ends, as long as that helps."""
     cycles = _cycles(board, ends[0])
     dead_ends = [v for v, nears in enumerate(board.near) if len(nears) == 1]
     shorter = True
@@ -50,7 +51,7 @@ def _turn(board: Board, times: dict[Edge, int], ends: list[int], movable: list[i
 
 
 def _turned_over(board: Board, times: dict[Edge, int], edges: list[Edge]) -> bool:
-    """Turns edges over and drops what can be, if that makes the walk shorter."""
+    """Turns edges over and drops what can be dropped, if that makes the walk shorter; says whether it did."""
     turned = dict(times)
     for edge in edges:
         turned[edge] = 1 if times.get(edge, 0) in (0, 2) else 2
@@ -78,7 +79,7 @@ def _way(board: Board, start: int, target: int) -> list[Edge]:
 
 
 def _drop(board: Board, times: dict[Edge, int], edge: Edge) -> None:
-    """Leaves an edge out if its cells hang together without it."""
+    """Drops an edge if its cells stay connected without it."""
     a, b = edge
     seen, queue = {a}, [a]
     for here in queue:
@@ -93,7 +94,7 @@ def _drop(board: Board, times: dict[Edge, int], edge: Edge) -> None:
 
 
 def _cycles(board: Board, root: int) -> list[list[Edge]]:
-    """The cycles that each edge beyond a breadth-first tree closes."""
+    """The cycles that the edges outside a breadth-first tree close."""
     parent, depth, queue = {root: root}, {root: 0}, [root]
     for here in queue:
         for j in board.near[here]:

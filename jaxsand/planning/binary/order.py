@@ -1,4 +1,4 @@
-"""In which order to sweep over a block's cells, so that few are half done at a time."""
+"""The order in which a sweep passes a block's cells, chosen so that few are half done at a time."""
 
 from collections.abc import Sequence
 
@@ -8,8 +8,10 @@ from jaxsand.planning.binary.board import Block, Cell
 
 
 def sweep_order(block: Block, places: Sequence[Cell]) -> list[int]:
-    """An order of the block's cells whose frontier (cells passed that still have neighbours to come) is small: the best of
-    sweeps along rows, columns and both diagonals, and of greedy growth from the far corners."""
+    """An order of the block's cells with a small frontier (cells passed that still have neighbours to come).
+
+    It is the best of sweeps along rows, columns and both diagonals, and of greedy growth from the far corners.
+    """
     near: dict[int, list[int]] = {v: [] for v in block.cells}
     for a, b in block.edges:
         near[a].append(b)
@@ -23,7 +25,7 @@ def sweep_order(block: Block, places: Sequence[Cell]) -> list[int]:
 
 
 def _burden(near: dict[int, list[int]], order: list[int]) -> float:
-    """What a sweep costs, about: states triple with every cell of the frontier."""
+    """About what a sweep costs: the states triple with every cell of the frontier."""
     missing = {v: len(nears) for v, nears in near.items()}
     frontier: set[int] = set()
     total = 0.0
@@ -37,7 +39,9 @@ def _burden(near: dict[int, list[int]], order: list[int]) -> float:
 
 
 def _grow(near: dict[int, list[int]], first: int) -> list[int]:
-    """Takes next, among the frontier's neighbours, the cell that leaves the smallest frontier; the longest waiting first."""
+    """Grows an order from a cell: next comes the neighbour that leaves the smallest frontier, among equals the one waiting
+    longest.
+    """
     missing = {v: len(nears) for v, nears in near.items()}
     order, waiting = [], {first: None}
     done = set()

@@ -1,8 +1,8 @@
 """The paper's search: A* in which the tool may also dig wrong cells (arXiv:1908.02745, "Single Stroke").
 
-What the paper leaves open is read so as to explain its counts: the start cell counts as dug; the tool may leave the map by a
-margin of one cell; h = cells still to dig + cells wrongly dug, f = g + (7.2 / alpha) h, first in first out among equal f; a
-state is closed when it is expanded, and never opened again; every expansion opens four nodes.
+What the paper leaves open is chosen so as to explain its counts: the start cell counts as dug; the tool may leave the map by
+a margin of one cell; h = cells still to dig + cells wrongly dug, f = g + (7.2 / alpha) h, first in first out among equal f;
+a state is closed when it is expanded, and never opened again; every expansion opens four nodes.
 """
 
 import heapq
@@ -15,10 +15,10 @@ ALPHA = 7.2
 
 
 def paper(problem: Problem, alpha: float = ALPHA, bound: int = 2_000_000) -> Found:
-    """The paper's A*; lower `alpha` is greedier. At 7.2 or above the walk found is proven shortest: with a weight of at most
-    1, and as h changes by at most 1 a step, f never falls along a path.
+    """The walk that the paper's A* finds; a lower `alpha` is greedier.
 
-    Gives up after `bound` expansions. The lower bound is 0 where the search proves none.
+    At alpha 7.2 or above the walk is proven shortest: with a weight of at most 1, and as h changes by at most 1 in a step, f
+    never falls along a path. The search gives up after `bound` expansions. The lower bound is 0 where it proves none.
     """
     board = problem.board
     rows, columns = (n + 2 for n in board.shape)

@@ -10,12 +10,23 @@ _NAMES = {move: name for name, move in MOVES.items()}
 
 @dataclass(frozen=True)
 class Plan:
-    """A walk over the cells of a map.
+    """A walk over the cells of a binary map; `plan` returns it.
 
-    `path` spells the steps (N, E, S, W; N is up in the text), `cells` lists the cells passed (row, column; row 0 on top),
-    the start included. `cost` is the number of `steps` and what the turns cost. No walk costs less than `lower_bound`, and
-    the plan is proven best when `optimal`. `expanded` counts the states that the search took up, `opened` the children it
-    looked at, `engine` names the search.
+    Attributes:
+      path: the steps as letters N, E, S, W; N is up in the text.
+      cells: (row, column) of the cells passed, row 0 on top, the start included.
+      steps: how many steps there are.
+      cost: the steps, and what the turns cost.
+      optimal: whether the walk is proven to cost least.
+      lower_bound: no walk costs less.
+      expanded: how many states the search took up.
+      opened: how many children it looked at.
+      engine: the name of the search.
+
+    Example:
+      >>> found = js.plan(np.array([[True, True]]), start=(0, 0))
+      >>> found.path, found.cells, found.gap
+      ('E', ((0, 0), (0, 1)), 0.0)
     """
 
     path: str
@@ -30,17 +41,18 @@ class Plan:
 
     @property
     def start(self) -> Cell:
+        """The first cell."""
         return self.cells[0]
 
     @property
     def gap(self) -> float:
-        """How far the cost can be from the best, as a share of the lower bound."""
+        """How far the cost can be above the least, as a share of the lower bound."""
         return (self.cost - self.lower_bound) / self.lower_bound if self.lower_bound else 0.0
 
 
 @dataclass(frozen=True)
 class Found:
-    """What an engine found: a walk over cell numbers (None if it gave up), and what it proved."""
+    """What an engine found: a walk over the board's cells (None if it gave up), and what it proved."""
 
     walk: list[int] | None
     lower_bound: float
@@ -49,6 +61,7 @@ class Found:
 
 
 def as_plan(problem: Problem, found: Found, engine: str) -> Plan:
+    """The plan of a walk that an engine found."""
     assert found.walk is not None
     cells = tuple(problem.board.cells[i] for i in found.walk)
     path = "".join(_NAMES[b[0] - a[0], b[1] - a[1]] for a, b in pairwise(cells))
@@ -59,7 +72,7 @@ def as_plan(problem: Problem, found: Found, engine: str) -> Plan:
 
 
 def walk_cost(problem: Problem, walk: list[int]) -> float:
-    """Steps, and what the changes of heading cost."""
+    """The steps of a walk, and what its changes of heading cost."""
     steps = len(walk) - 1
     if not problem.turn_cost:
         return steps
@@ -68,5 +81,6 @@ def walk_cost(problem: Problem, walk: list[int]) -> float:
 
 
 def heading(board: Board, a: int, b: int) -> Cell:
+    """The row and column that the step from a to b goes on."""
     (r, c), (s, d) = board.cells[a], board.cells[b]
     return s - r, d - c

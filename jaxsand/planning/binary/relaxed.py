@@ -1,10 +1,10 @@
-"""What the rest of a sweep costs at least, when one forgets which cells hang together.
+"""A lower bound of what the rest of a sweep costs, found by ignoring which cells are connected.
 
-For each cell of the frontier only this is kept: alone (nothing hangs together with it yet, so it still needs an edge), even,
-or odd. The cheapest way to give every cell left an edge and the degree it must have, from each such state, is a dynamic
-programme backwards along the sweep. Every true walk is one of those ways, so this is a lower bound, and exact but for
-connection. Where the frontier is too wide for its table, the bound counts degrees: each edge has one end of each colour, so
-the degrees still missing on either colour are a lower bound.
+For each cell of the frontier only this is kept: alone (it has no edge yet, so it still needs one), even, or odd. The
+cheapest way to give every cell left an edge and the degree it must have, from each such state, is a dynamic programme
+backwards along the sweep. Every true walk is one of those ways, so this is a lower bound, and exact but for connection.
+Where the frontier is too wide for its table, the bound counts degrees: each edge has one end of each colour, so the degrees
+still missing on either colour are a lower bound.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,12 +25,15 @@ _JOINED, _FLIPPED = np.array([EVEN, EVEN, ODD]), np.array([ODD, ODD, EVEN])
 
 @dataclass(frozen=True)
 class Tables:
-    """The costs of the rest before each step: for step k an array [ends spent, state of each live slot...], flat."""
+    """The bound as tables: for step k the costs of the rest by [ends spent, state of each live slot...], flat."""
 
     costs: list[np.ndarray]
 
     def bound(self, k: int, kinds: np.ndarray, spent: np.ndarray) -> np.ndarray:
-        """For states [n] before step k: `kinds` [live, n] of alone, even, odd in the order of the live slots."""
+        """The bound [n] for states before step k.
+
+        `kinds` [live, n] are alone, even or odd in the order of the live slots; `spent` [n] counts the ends spent.
+        """
         place = spent.astype(np.int64)
         for row in kinds:
             place = 3 * place + row
@@ -39,8 +42,15 @@ class Tables:
 
 @dataclass(frozen=True)
 class Degrees:
-    """What is missing before each step: degrees of the cells to come by colour; the colours of the live slots, and which of
-    them is a gate that must be odd; and what the ends may take off."""
+    """The bound by degrees.
+
+    Attributes:
+      to_come: before each step, the degrees that the cells to come need, by colour.
+      colours: before each step, the colours of the live slots.
+      gates: before each step, which of the live slots is a gate that must be odd.
+      count: ends of the walk.
+      most: the most that an end may take off the cost.
+    """
 
     to_come: list[tuple[int, int]]
     colours: list[np.ndarray]
@@ -49,6 +59,7 @@ class Degrees:
     most: int
 
     def bound(self, k: int, kinds: np.ndarray, spent: np.ndarray) -> np.ndarray:
+        """The bound [n] for states before step k; see `Tables.bound`."""
         missing = np.where(self.gates[k][:, None], np.array([1, 1, 0])[kinds], np.array([2, 0, 1])[kinds])
         dark = self.colours[k][:, None] == 1
         a = self.to_come[k][0] + np.where(dark, 0, missing).sum(0)
@@ -63,13 +74,14 @@ Rest = Tables | Degrees
 
 
 def rest_of(steps: Sequence["Step"], ends: "Ends", colour: Sequence[int], tick: Callable[[], None]) -> Rest:
-    """Tables where they are small enough, else the bound by degrees."""
+    """The bound for a sweep: tables where they are small enough, else degrees."""
     live = [len(step.live) for step in steps]
     entries = sum(3**n for n in live) * (ends.count + 1) if max(live) <= _WIDEST else _ENTRIES + 1
     return _tables(steps, ends, tick) if entries <= _ENTRIES else _degrees(steps, ends, colour)
 
 
 def _tables(steps: Sequence["Step"], ends: "Ends", tick: Callable[[], None]) -> Tables:
+    """The tables, from the last step backwards."""
     rest: np.ndarray = np.full(ends.count + 1, FAR, np.int32)
     rest[ends.count] = 0
     costs = [rest]

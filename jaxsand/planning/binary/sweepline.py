@@ -1,15 +1,14 @@
-"""The cheapest walk over one block, proven: a dynamic programme along a sweep over its cells.
+"""The cheapest walk over one block, proven, by dynamic programming along a sweep over its cells.
 
 A walk over a block is a connected multigraph on its edges, each taken 0, 1 or 2 times (three are never better than one),
-that touches every cell; only the walk's ends have odd degree. Cells are passed one by one; of the part passed, only this
+that touches every cell; only the walk's ends have odd degree. Cells are passed one by one. Of the part passed, only this
 matters for the rest: for each cell of the frontier (passed, with neighbours still to come) whether its degree is odd and
-with which others it hangs together, and how many ends have been spent. Of two partial walks with the same such state the
-cheaper is kept. So far this is the frontier method (Simpath, Knuth 2008; Cook and Seymour's tour merging 2003).
+which others it is connected with, and how many ends have been spent. Of two partial walks with the same such state the
+cheaper is kept. This is the frontier method (Simpath, Knuth 2008; Cook and Seymour's tour merging 2003).
 
-The search is deepened: a state stays while its cost and a lower bound of the rest, which forgets who hangs together
-(relaxed.py), are at most F, and F grows from the bound of the whole by as little as can be until a walk is found, which is
-then shortest. With more than `width` states the best are kept: a walk found then has its cost, and what was proven before
-stays proven.
+The search is deepened: a state stays while its cost and a lower bound of the rest, which ignores connections (relaxed.py),
+are at most F. F grows from the bound of the whole by as little as can be until a walk is found, which is then shortest. With
+more than `width` states the best are kept: a walk found then has its cost, and what was proven before stays proven.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,8 +32,15 @@ class OutOfTime(Exception):  # noqa: N818 - not an error
 
 @dataclass(frozen=True)
 class Step:
-    """One cell is passed: it takes a slot, meets the passed neighbours in `edges` (slot, number of the edge), and the slots
-    in `leaving` (slot, cell) have no neighbours to come."""
+    """One step of a sweep, which passes one cell.
+
+    Attributes:
+      cell: the cell.
+      slot: its place in the states.
+      edges: its edges to cells passed before, as (slot, number of the edge).
+      leaving: the cells (slot, cell) that have no neighbours to come after this step.
+      live: the slots of the frontier afterwards.
+    """
 
     cell: int
     slot: int
@@ -45,8 +51,14 @@ class Step:
 
 @dataclass(frozen=True)
 class Ends:
-    """Where the walk may end: an odd degree at `gate` if `from_gate`; `count` more ends at cells of `gains`, each of which
-    takes its gain off the cost."""
+    """Where a walk over a block may end.
+
+    Attributes:
+      gate: a cell.
+      from_gate: whether the walk ends there.
+      count: how many other ends it has.
+      gains: the cells where these may lie, and what each takes off the cost.
+    """
 
     gate: int
     from_gate: bool
@@ -54,7 +66,7 @@ class Ends:
     gains: Gains
 
     def leave(self, cell: int) -> tuple[bool, int | None]:
-        """Whether a cell's even degree is allowed, and what an odd one as an end gains (None: not allowed)."""
+        """Whether a cell's degree may be even, and what it takes off the cost as an end (None: it may not be odd)."""
         if cell == self.gate:
             return not self.from_gate, (0 if self.from_gate else None)
         return True, (self.gains.get(cell) if self.count else None)
@@ -62,8 +74,14 @@ class Ends:
 
 @dataclass(frozen=True)
 class Tour:
-    """The cheapest found: how often it takes each edge, and its cost less gains (FAR if nothing was found); no walk costs
-    less than `lower_bound`; `states` were expanded."""
+    """The cheapest walk found over a block.
+
+    Attributes:
+      times: how often it takes each edge.
+      cost: its steps less the gains of its ends; `FAR` if none was found.
+      lower_bound: no walk costs less.
+      states: how many states were expanded.
+    """
 
     times: tuple[int, ...]
     cost: int
@@ -72,7 +90,7 @@ class Tour:
 
 
 def steps_of(block: Block, places: Sequence[Cell]) -> list[Step]:
-    """The sweep over a block."""
+    """The steps of a sweep over a block."""
     order = sweep_order(block, places)
     meets: dict[int, list[tuple[int, int]]] = {v: [] for v in block.cells}
     for k, (a, b) in enumerate(block.edges):
@@ -100,8 +118,16 @@ def steps_of(block: Block, places: Sequence[Cell]) -> list[Step]:
 
 @dataclass
 class _States:
-    """Partial walks [n]: who hangs together with whom (the lowest slot of the set) and odd degrees [slots, n], ends spent,
-    costs; where each came from in the last cell's states, and by which choices (0, 1, 2 of base 3)."""
+    """Partial walks [n].
+
+    Attributes:
+      hang: [slots, n] the lowest slot among those connected with each slot.
+      odd: [slots, n] whether the degree is odd.
+      spent: [n] ends spent.
+      cost: [n].
+      origin: [n] the state of the last step that each came from.
+      choice: [n] how often it takes the step's edges, as digits of base 3.
+    """
 
     hang: np.ndarray
     odd: np.ndarray
@@ -137,9 +163,9 @@ class Sweep:
         self.least = self.proven = int(self.rest.bound(0, none, np.zeros(1, np.uint8))[0])
 
     def search(self, width: int, tick: Callable[[], None], old: Tour | None = None) -> Tour:
-        """Deepens from the bound of the whole, or from what an `old` search proved, until a walk is found.
+        """Deepens the search until a walk is found, from the bound of the whole or from what an `old` search proved.
 
-        At each depth few states are tried first: if they find a walk, it is shortest, and if none were left out, there is
+        At each depth few states are tried first: if they find a walk, it is shortest, and if none was left out, there is
         none. `proven` holds what is proven so far, also if `tick` raises.
         """
         limit = self.proven = max(self.least, old.lower_bound if old else self.least)
@@ -163,6 +189,7 @@ class Sweep:
         return Tour(old.times if old else (), old.cost if old else FAR, self.proven, states)
 
     def _pass(self, limit: int, width: int, tick: Callable[[], None]) -> "_Pass":
+        """One sweep with states up to the cost `limit`, of which `width` are kept."""
         slots = 1 + max(step.slot for step in self.steps)
         small = np.uint8 if slots < 255 else np.uint16
         state = _States(
@@ -211,6 +238,16 @@ class Sweep:
 
 @dataclass(frozen=True)
 class _Pass:
+    """What one sweep found.
+
+    Attributes:
+      times: how often the walk takes each edge; None without a walk.
+      cost: of the walk.
+      states: how many states were expanded.
+      complete: whether no state was left out for want of room.
+      next: the least cost above the limit that was seen.
+    """
+
     times: tuple[int, ...] | None
     cost: int
     states: int
@@ -219,7 +256,7 @@ class _Pass:
 
 
 def _advance(state: _States, step: Step, ends: Ends, *, last: bool) -> _States:
-    """All ways to pass one cell."""
+    """The states after one cell is passed in every possible way."""
     n = len(state.cost)
     state = replace(state, hang=state.hang.copy(), odd=state.odd.copy(), origin=np.arange(n), choice=np.zeros(n, np.uint8))
     state.hang[step.slot] = step.slot
@@ -248,7 +285,9 @@ def _advance(state: _States, step: Step, ends: Ends, *, last: bool) -> _States:
 
 
 def _leave(state: _States, slot: int, cell: int, ends: Ends, *, last: bool) -> _States:
-    """A cell without neighbours to come leaves the frontier: it must hang on another, and its degree must be allowed."""
+    """The states after a cell has left the frontier, which needs a neighbour that it is connected with and an allowed
+    degree.
+    """
     even, gain = ends.leave(cell)
     odd = state.odd[slot]
     others = state.hang == state.hang[slot]
@@ -279,7 +318,7 @@ def _kinds(state: _States, live: list[int]) -> np.ndarray:
 
 
 def _cheapest(state: _States, live: list[int]) -> np.ndarray:
-    """Which of the states [n] to keep: of equals the cheapest."""
+    """Which of the states [n] to keep: the cheapest of equal ones."""
     if len(state.cost) < 2:
         return np.arange(len(state.cost))
     bits = len(state.hang).bit_length() + 1

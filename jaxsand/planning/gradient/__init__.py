@@ -1,8 +1,8 @@
-"""Strokes that turn a start map into a goal map, by gradients through the simulator.
+"""Finds strokes that turn a start map into a goal map, by gradients through the simulator.
 
-First guesses cost one call (sketch.py): the print of one stroke, matched to the goal. Then rounds of moves (moves.py) on
-several plans at once: other orders and directions, Adam on blurred and then on sharp maps, strokes put where sand is still
-due, L-BFGS, until the goal is reached or the budget is spent.
+First guesses cost one call (sketch.py): the marks of strokes, copied from one simulated stroke, are matched to the goal.
+Then several plans at once are improved in rounds (moves.py): other orders and directions, Adam on blurred and then on sharp
+maps, strokes placed where the goal is not yet reached, and L-BFGS, until the goal is reached or the budget is spent.
 """
 
 import math
@@ -28,9 +28,22 @@ _NEARLY = 1.15  # times the least that prints leave of the squared change
 
 @dataclass(frozen=True)
 class Optimised:
-    """What `optimise_strokes` found: the plan `strokes` [N, 4] (m) and the `height` [H, W] (m) that it leaves; the `losses`
-    (m^2) of the start and of every better plan on the way, the `calls` after which each was found, and those `spent` in all
-    (pushes simulated, a gradient counted at what it costs)."""
+    """What `optimise_strokes` found.
+
+    Attributes:
+      strokes: the best plan [N, 4] = x0, y0, x1, y1 (m), in order; N is 0 if nothing was found or nothing is to change.
+      losses: sum (h - goal)^2 (m^2) of the start, then of every better plan found on the way [K]; the last is that of
+        `strokes`.
+      calls: after how many calls of the simulator each of `losses` was found [K].
+      spent: calls in all: pushes simulated, a gradient counted as what it costs.
+      height: the map [H, W] (m) that `strokes` leave.
+
+    Example:
+      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
+      >>> found = js.optimise_strokes(scene, goal=jnp.zeros((16, 16)), strokes=1)
+      >>> found.strokes.shape, found.spent
+      ((0, 4), 0)
+    """
 
     strokes: np.ndarray
     losses: np.ndarray
@@ -41,8 +54,17 @@ class Optimised:
 
 @dataclass(frozen=True)
 class Blurred:
-    """Smoothing: before anything goes downhill on sharp maps, Adam sees them and the goal blurred by Gaussians of these
-    standard deviations, in `cells`, one after the other. A stroke beside its trench then feels it from farther away."""
+    """Blurs maps and goal before gradients are taken, so that a stroke beside its trench feels it from farther away.
+
+    `optimise_strokes` takes a few steps of Adam for each width in turn, and then goes on with sharp maps.
+
+    Args:
+      cells: standard deviations of the Gaussians, in cells, in the order in which they are used.
+
+    Example:
+      >>> js.Blurred((2.0, 1.0)).cells
+      (2.0, 1.0)
+    """
 
     cells: tuple[float, ...] = (1.0,)
 
@@ -64,17 +86,42 @@ def optimise_strokes(
     guess: jax.typing.ArrayLike | None = None,
     tell: Tell = quiet,
 ) -> Optimised:
-    """Finds straight pushes that turn `start` [H, W] (m, at rest; level sand at 0 if None) into `goal` [H, W] (m).
+    """Finds straight pushes that turn one map into another, by gradients through the simulator.
 
-    Minimises sum (h - goal)^2 over plans of `strokes` pushes, or of as many as pay, up to `most`, if None. Stops at a
-    ten-thousandth of the start's loss, or after `budget` simulator calls. Where nothing is to change, or nothing was found
-    that brings the sand closer than it was, there are no strokes. The same key finds the same plan on the same machine. Not
-    differentiable itself. The first call for a shape of map compiles, for about half a minute on two cores.
+    Minimises sum (h - goal)^2 over plans of strokes, h [H, W] the map that a plan leaves. Stops when the loss is a
+    ten-thousandth of the start's, or when the budget is spent.
 
-    Given a `guess` [N, 4] (m), such as a policy's plan, it starts from that instead of from a sketch.
+    Args:
+      scene: grid, sand and a `Blade`.
+      goal: heights [H, W] (m), `goal[i, j]` at x = (j + 1/2) dx, y = (i + 1/2) dx.
+      strokes: how many pushes; None lets the optimiser choose as many as pay, up to `most`.
+      key: a JAX key or a whole number; the same key finds the same plan on the same machine.
+      start: the map [H, W] (m) before the first push, at rest; None stands for level sand at 0.
+      budget: how many calls of the simulator may be made; a push of one stroke is one call, its gradient four more.
+      most: the largest number of pushes if `strokes` is None.
+      smoothing: blurs the maps for the first steps; None does not.
+      guess: a plan [N, 4] (m) to start from, such as a policy's; None starts from a sketch.
+      tell: is called with a line of progress.
+
+    Returns:
+      An `Optimised`, with no strokes where nothing is to change or no plan brings the sand closer to the goal. Not
+      differentiable itself.
 
     Raises:
       ValueError: for a scene without a blade, a start or goal of another shape, or a key or count out of range.
+
+    The first call for a shape of map compiles, which takes about half a minute on two cores.
+
+    Example:
+      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
+      >>> js.optimise_strokes(scene, goal=jnp.zeros((16, 16)), strokes=1).losses.tolist()
+      [0.0]
+      >>> goal = jnp.zeros((16, 16)).at[8, 4:12].set(-0.004)
+      >>> found = js.optimise_strokes(scene, goal, strokes=1, budget=200)  # doctest: +SKIP
+      >>> found.losses[-1] < found.losses[0]  # doctest: +SKIP
+      True
+
+    The last lines are not run by the tests: compiling takes half a minute.
     """
     blade_of(scene)
     check_whole("budget", budget, 1)
@@ -107,7 +154,7 @@ def search(
     most: int = 8,
     smoothing: Blurred | None = Blurred(),
 ) -> None:
-    """Spends the account's budget on plans of so many strokes, or of as many as pay."""
+    """Spends the account's budget on plans of `strokes` strokes, or of as many as pay."""
     mark = print_of(account)
     count = strokes or as_many_as_pay(account, mark, most, rng)
     plans = first(account, mark, count, rng)
@@ -119,7 +166,7 @@ def search(
 
 
 def as_many_as_pay(account: Account, mark: Print, most: int, rng: np.random.Generator) -> int:
-    """The fewest strokes whose prints come nearly as close as those of any number up to `most`; without any calls."""
+    """The fewest strokes with which the sketch comes nearly as close as with any number up to `most`; calls no simulator."""
     sand, far = account.sand, list[float]()
     for n in range(1, most + 1):
         far.append(guesses(mark, sand.start, sand.goal, n, rng)[1][0])
@@ -129,7 +176,7 @@ def as_many_as_pay(account: Account, mark: Print, most: int, rng: np.random.Gene
 
 
 def print_of(account: Account) -> Print:
-    """What one stroke of half the map's shorter side leaves of level sand."""
+    """Simulates one stroke, half as long as the map's shorter side, on level sand, for the sketch."""
     scene = account.sand.scene
     rows, columns = scene.grid.shape
     dx = float(scene.grid.spacing)
@@ -152,7 +199,9 @@ def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator)
 
 
 def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Generator, smoothing: Blurred | None) -> None:
-    """Rounds of moves until the goal is reached or the budget is spent; none if no plan could be pushed yet."""
+    """Improves plans in rounds until the goal is reached or the budget is spent; does nothing if no plan has been pushed
+    yet.
+    """
     if not account.history:
         return
     dx = float(account.sand.scene.grid.spacing)
@@ -175,10 +224,12 @@ def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Ge
 
 
 def _joined(a: moves.Plans, b: moves.Plans) -> moves.Plans:
+    """Two sets of plans as one."""
     return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
 
 
 def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:
+    """A user's guess as an array [N, 4]."""
     plan = np.asarray(as_array("guess", guess), float)
     if plan.ndim != 2 or plan.shape[1] != 4 or strokes not in (None, len(plan)) or not np.isfinite(plan).all():
         raise ValueError(f"guess: got shape {list(plan.shape)}; give [{strokes or 'N'}, 4], finite x0, y0, x1, y1 in metres")
@@ -186,6 +237,7 @@ def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:
 
 
 def _entropy(key: jax.Array | int) -> np.ndarray:
+    """The whole numbers that seed a key stands for."""
     if hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.key_data(key)
     numbers = np.atleast_1d(np.asarray(key)).ravel()

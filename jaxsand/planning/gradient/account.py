@@ -1,4 +1,4 @@
-"""What the optimiser has spent and found: every stroke pushed on a map is a call, every gradient as many as it costs."""
+"""What the optimiser has spent and found: each stroke pushed on a map is one call, a gradient counts as what it costs."""
 
 from dataclasses import dataclass, field
 
@@ -11,7 +11,7 @@ from jaxsand.scene.progress import Tell, quiet
 
 @dataclass
 class Account:
-    """Counts calls up to a budget and keeps the best plan; every member function spends."""
+    """Counts the simulator's calls up to a budget and keeps the best plan; every method that pushes adds to the calls."""
 
     sand: SandLoss
     budget: int
@@ -26,14 +26,15 @@ class Account:
 
     @property
     def best(self) -> Best:
+        """The best plan so far."""
         return self.history[-1]
 
     def room(self, strokes: int) -> int:
-        """For how many plans of so many strokes there are calls left."""
+        """How many plans of `strokes` strokes the budget still allows."""
         return (self.budget - self.calls) // max(strokes, 1)
 
     def losses(self, plans: np.ndarray) -> np.ndarray:
-        """The losses of plans [P, N, 4]; infinite for those that the budget has no room for."""
+        """The losses [P] of plans [P, N, 4]; infinite for plans beyond the budget, which are not pushed."""
         some = plans[: self.room(plans.shape[1])]
         out = np.full(len(plans), np.inf)
         if len(some):
@@ -43,7 +44,7 @@ class Account:
         return out
 
     def gradient(self, plans: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
-        """The losses of plans, and the gradients of the losses of maps blurred by so many cells."""
+        """The losses [P] of plans [P, N, 4], and the gradients [P, N, 4] of the losses of maps blurred by `blur` cells."""
         self.calls += len(plans) * plans.shape[1] * (1 + GRADIENT)
         sharp: list[np.ndarray] = []
 
@@ -66,11 +67,12 @@ class Account:
         return self.sand.maps(plans)
 
     def after(self, height: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The losses and the maps after one more stroke of [P, 4] (m) each on a map [H, W]."""
+        """The losses [P] and the maps [P, H, W] after each of the strokes [P, 4] (m) on one map [H, W]."""
         self.calls += len(strokes)
         return self.sand.after(np.repeat(height[None], len(strokes), axis=0), strokes)
 
     def _note(self, plans: np.ndarray, losses: np.ndarray) -> None:
+        """Keeps the best of some plans if it beats all before."""
         first = int(np.argmin(losses))
         if np.isfinite(losses[first]) and (not self.history or losses[first] < self.best.loss):
             self.history.append(Best(self.calls, float(losses[first]), plans[first].copy()))

@@ -1,6 +1,7 @@
-"""How plans are made better: downhill by gradients, by other orders and directions, by strokes put where sand is still due.
+"""Moves that improve plans: downhill by gradients, other orders and directions, strokes placed where the goal is not
+reached.
 
-A move takes plans [P, N, 4] (m) with their losses, closest first, and gives back plans that are no worse.
+A move takes plans [P, N, 4] (m) with their losses, closest first, and returns plans that are no worse.
 """
 
 from typing import Any
@@ -20,7 +21,7 @@ _TRIED = 3  # strokes that are tried in the place of one
 
 
 def ranked(plans: np.ndarray, losses: np.ndarray, most: int) -> Plans:
-    """The best `most` plans that differ."""
+    """The best `most` plans, no two of them alike within 0.1 mm."""
     kept: list[int] = []
     for i in np.argsort(losses, kind="stable"):
         if all(np.abs(plans[i] - plans[k]).max() > 1e-4 for k in kept):
@@ -31,7 +32,7 @@ def ranked(plans: np.ndarray, losses: np.ndarray, most: int) -> Plans:
 
 
 def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 0.0) -> Plans:
-    """Downhill by Adam, whose first step is `size` (m) and whose last a tenth of it."""
+    """Follows the gradient by Adam; its first step is `size` (m) long, its last a tenth of that."""
     plans, losses = start[0].copy(), start[1].copy()
     rule = optax.adam(optax.cosine_decay_schedule(size, max(steps, 1), 0.1), b2=0.95)
     here: Any = plans.copy()
@@ -48,7 +49,7 @@ def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 
 
 
 def quasi_newton(account: Account, start: Plans, steps: int) -> Plans:
-    """Downhill by L-BFGS, every plan for itself; of four lengths of a step the best is taken."""
+    """Follows the gradient by L-BFGS, every plan for itself; of four step lengths the best is taken."""
     plans, losses = start[0].copy(), start[1].copy()
     rule = optax.scale_by_lbfgs(_MEMORY)
     scale = 1e-3  # metres to about the size that gradients change over
@@ -74,7 +75,7 @@ def quasi_newton(account: Account, start: Plans, steps: int) -> Plans:
 
 
 def reordered(account: Account, start: Plans) -> Plans:
-    """The best plan with two strokes swapped or one turned round, as long as that helps."""
+    """Swaps two strokes of the best plan, or reverses one, as long as that helps."""
     plans, losses = start
     while True:
         plan, n = plans[0], plans.shape[1]
@@ -91,7 +92,7 @@ def reordered(account: Account, start: Plans) -> Plans:
 
 
 def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generator) -> Plans:
-    """The best plan with one of its strokes put where the others leave most undone, first or last or in its place."""
+    """Moves one stroke of the best plan to where the others leave most to do, as the first, the last, or in its place."""
     plans, losses = start
     plan, n = plans[0], plans.shape[1]
     dx = float(account.sand.scene.grid.spacing)
@@ -112,8 +113,11 @@ def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generat
 
 
 def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.Generator) -> Plans:
-    """A plan found on the sand itself, in about so many calls: each stroke is the best of those tried on what earlier ones
-    left. They run from where sand is too high to where it is too low, or anywhere, and then from near the best."""
+    """Builds a plan on the sand itself, stroke by stroke, in about `calls` calls.
+
+    Each stroke is the best of those tried on the map that the strokes before it left. They run from where sand is too high
+    to where it is too low, or anywhere; later ones lie near the best.
+    """
     sand, low, high = account.sand, *account.sand.bounds
     dx = float(sand.scene.grid.spacing)
     here, plan = sand.start, np.zeros((0, 4))
@@ -141,7 +145,7 @@ def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.
 
 
 def _from_high_to_low(off: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Strokes [n, 4] (cells) from where sand is too high to where it is too low, the likelier the more."""
+    """Random strokes [n, 4] (cells) from where `off` [H, W] is above 0 to where it is below, in proportion to its size."""
     ends = []
     for much in (np.maximum(off, 0), np.maximum(-off, 0)):
         share = (much + 1e-12).ravel()
@@ -151,5 +155,6 @@ def _from_high_to_low(off: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _inside(account: Account, plans: np.ndarray) -> np.ndarray:
+    """The plans with every stroke moved onto the map."""
     low, high = account.sand.bounds
     return np.clip(plans, low, high)

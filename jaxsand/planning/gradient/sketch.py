@@ -1,14 +1,15 @@
-"""First guesses, at the cost of one call: strokes whose prints, taken from one stroke in the simulator, make up the goal.
+"""First guesses at the cost of one call: copies of one simulated stroke's mark are put together to make the goal.
 
-A print is what one stroke leaves of level sand, moved, turned and lengthened in its middle. Stroke after stroke, sand is cut
-down to the print's trench, and raised by its berms. Strokes between the cells to be dug are matched in this way to the goal,
-one after the other, keeping several plans at a time; then all strokes of a plan are moved by Adam, first on blurred maps,
-then on sharper ones, and put in the order that comes closest.
+The mark of a stroke is the map that it leaves on level sand. A copy can be moved, turned, and lengthened in its middle.
+Copies are laid one after the other: where a mark is below 0, the sand is cut down to it, and where it is above, it is added.
+
+The goal's cells to dig are joined by candidate strokes. These are matched to the goal one after the other, keeping several
+plans at a time. Then all strokes of a plan are moved by Adam, first on blurred maps, then on sharper ones, and put in the
+order that comes closest to the goal.
 """
 
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,13 @@ _SCALE = 1e4  # squared metres to about 1
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Print:
-    """What a stroke along x leaves of level sand: `height` [H, W] (m), its first point and its length in cells."""
+    """The mark of a simulated stroke along x on level sand.
+
+    Attributes:
+      height: [H, W] (m).
+      start: column and row of the stroke's first point; cell centres are whole numbers.
+      length: of the stroke, in cells.
+    """
 
     height: jax.Array
     start: jax.Array  # column and row of the first point; cell centres are whole numbers
@@ -38,7 +45,7 @@ class Print:
 
 
 def prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Array:
-    """What strokes [..., 4] (in cells, cell centres at whole numbers and a half) leave of level sand: [..., H, W]."""
+    """The marks [..., H, W] (m) of strokes [..., 4] (in cells, cell centres at whole numbers and a half) on level sand."""
     ones = (1,) * (strokes.ndim - 1)
     x = (jnp.arange(shape[1], dtype=strokes.dtype) + 0.5).reshape(*ones, 1, shape[1])
     y = (jnp.arange(shape[0], dtype=strokes.dtype) + 0.5).reshape(*ones, shape[0], 1)
@@ -54,20 +61,24 @@ def prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Array
 
 
 def printed(mark: Print, strokes: jax.Array, start: jax.Array) -> jax.Array:
-    """What prints of strokes [N, 4] (cells), one after the other, make of a map [H, W] (m)."""
+    """The map [H, W] (m) after the marks of strokes [N, 4] (cells) are laid one after the other on `start` [H, W]."""
     each = prints(mark, strokes, (start.shape[0], start.shape[1]))
     return jax.lax.scan(lambda h, one: (_laid(h, one), None), start, each)[0]
 
 
 def _laid(height: jax.Array, one: jax.Array) -> jax.Array:
+    """Lays a mark on a map: cuts the sand down to the mark where that is below 0, and adds it elsewhere."""
     return jnp.where(one < 0, jnp.minimum(height, one), height + one)
 
 
 def guesses(
     mark: Print, start: np.ndarray, goal: np.ndarray, strokes: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Plans [P, N, 4] (cells) whose prints turn `start` [H, W] (m) into nearly `goal`, the closest first; and the shares [P]
-    of the squared distance that they leave."""
+    """Plans whose marks turn `start` [H, W] (m) into nearly `goal` [H, W] (m).
+
+    Returns:
+      Plans [P, N, 4] (cells), closest first, and the shares [P] of the squared distance that they leave.
+    """
     plans = _matched(mark, start, goal, strokes, rng)
     count = len(plans)
     places = 1 if strokes == 1 else -(-strokes // _TOGETHER) * _TOGETHER
@@ -84,12 +95,13 @@ def guesses(
 
 
 def _bell(blur: float) -> np.ndarray:
+    """A Gaussian of 13 taps, of standard deviation `blur` cells."""
     bell = np.exp(-0.5 * (np.arange(-6, 7) / max(blur, 1e-3)) ** 2)
     return bell / bell.sum()
 
 
 def _reordered(mark: Print, plans: jax.Array, strokes: int, start: jax.Array, goal: jax.Array) -> jax.Array:
-    """Every plan with two strokes swapped, as long as that brings its prints closer."""
+    """Swaps two strokes of every plan, as long as that brings its marks closer to the goal."""
     orders = np.tile(np.arange(plans.shape[1]), (strokes * (strokes - 1) // 2 + 1, 1))
     orders[:-1, :strokes] = swaps(strokes)
     for _ in range(strokes):
@@ -102,12 +114,13 @@ def _reordered(mark: Print, plans: jax.Array, strokes: int, start: jax.Array, go
 
 
 def swaps(count: int) -> np.ndarray:
-    """The orders [pairs, count] of so many strokes in which two have changed places."""
+    """The orders [pairs, count] of `count` strokes in which two have changed places."""
     orders = [[*range(i), j, *range(i + 1, j), i, *range(j + 1, count)] for i in range(count) for j in range(i + 1, count)]
     return np.array(orders, int).reshape(-1, count)
 
 
 def _matched(mark: Print, start: np.ndarray, goal: np.ndarray, strokes: int, rng: np.random.Generator) -> np.ndarray:
+    """Plans [P, N, 4] (cells) built stroke by stroke from candidates between the cells to dig, several plans at a time."""
     ways = _ways(goal - start, rng)
     filled = np.broadcast_to(_NOWHERE, (_POINTS * (_POINTS - 1), 4)).astype(np.float32)
     filled[: len(ways)] = ways
@@ -136,7 +149,7 @@ def _matched(mark: Print, start: np.ndarray, goal: np.ndarray, strokes: int, rng
 
 
 def _ways(change: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Strokes [n, 4] (cells) between some of the cells to be dug."""
+    """Candidate strokes [n, 4] (cells): all that join up to 48 well spread cells of those to dig."""
     depth = -min(float(change.min()), 0.0)
     rows, columns = np.nonzero(change < -depth / 4)
     if not len(rows):
@@ -158,33 +171,37 @@ def _prints(mark: Print, strokes: jax.Array, shape: tuple[int, int]) -> jax.Arra
 
 
 @cache
-def _adam() -> Any:
+def _adam() -> optax.GradientTransformation:
     return optax.adam(_STEP)
 
 
 @jax.jit
 def _far_after(maps: jax.Array, each: jax.Array, goal: jax.Array) -> jax.Array:
-    """The squared distances [P, W] from the goal of maps [P, H, W] after each of W prints."""
+    """The squared distances [P, W] from the goal of maps [P, H, W] after each of W marks."""
     return jax.lax.map(lambda h: jnp.sum((_laid(h[None], each) - goal[None]) ** 2, axis=(1, 2)), maps)
 
 
 def _off(mark: Print, plan: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
+    """The map that a plan's marks make, less the goal."""
     return printed(mark, plan, start) - goal
 
 
 @jax.jit
 def _far(mark: Print, plans: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
+    """The squared distances [P] (scaled) of what the plans' marks make from the goal."""
     return jax.vmap(lambda plan: jnp.sum(_off(mark, plan, start, goal) ** 2) * _SCALE)(plans)
 
 
 @jax.jit
 def _far_in_orders(mark: Print, plans: jax.Array, orders: jax.Array, start: jax.Array, goal: jax.Array) -> jax.Array:
-    """The squared distances [P, O] of plans in other orders [O, N]."""
+    """The squared distances [P, O] (scaled) of plans whose strokes are put in the orders [O, N]."""
     return jax.lax.map(lambda plan: _far(mark, plan[orders], start, goal), plans)
 
 
 @jax.jit
 def _moved(mark: Print, plans: jax.Array, start: jax.Array, goal: jax.Array, taps: jax.Array) -> jax.Array:
+    """The plans after Adam has moved their strokes, on maps smoothed with the filter `taps`."""
+
     def smooth(h: jax.Array) -> jax.Array:
         for axis in (0, 1):
             h = jnp.apply_along_axis(lambda row: jnp.convolve(row, taps, mode="same"), axis, h)
@@ -193,7 +210,7 @@ def _moved(mark: Print, plans: jax.Array, start: jax.Array, goal: jax.Array, tap
     def far(plan: jax.Array) -> jax.Array:
         return jnp.sum(smooth(_off(mark, plan, start, goal)) ** 2) * _SCALE
 
-    def step(carry: Any, _: Any) -> tuple[Any, None]:
+    def step(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple[jax.Array, optax.OptState], None]:
         plans, state = carry
         update, state = _adam().update(jax.vmap(jax.grad(far))(plans), state)
         return (optax.apply_updates(plans, update), state), None

@@ -1,1 +1,1 @@
-"""Strokes proposed by a network, and looking ahead with them."""
+"""A network that proposes strokes, and look-ahead with the simulator."""

@@ -1,5 +1,6 @@
-"""Looking ahead with the simulator as a model: what a policy proposes is tried on the sand, the best plans go on, and the
-closest is put right."""
+"""Look-ahead with the simulator as a model: a policy's proposals are pushed, the best plans go on, and the closest is
+refined.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,15 +15,20 @@ _ASIDE = (0.25, 0.1)  # cells: so far the numbers of a plan are moved, to see wh
 
 
 class Proposes(Protocol):
-    """Such as `policy.Policy`."""
+    """A policy that proposes strokes, such as `policy.Policy`."""
 
     def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """The plan `strokes` [N, 4] (m), the squared distances `losses` [N + 1] (m^2) of the start and after each stroke, and
-    the `calls` of the simulator that it took."""
+    """A plan found by looking ahead.
+
+    Attributes:
+      strokes: [N, 4] (m).
+      losses: [N + 1] squared distances (m^2) from the goal, of the start and after each stroke.
+      calls: how often the simulator was called.
+    """
 
     strokes: np.ndarray
     losses: np.ndarray
@@ -32,9 +38,18 @@ class Ahead:
 def one_after_the_other(
     policy: Proposes, scene: Scene, start: np.ndarray, goal: np.ndarray, strokes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The policy alone, for many goals [B, H, W] (m) at once: its likeliest stroke on the sand as it is then, so many times,
-    whatever comes of it. Gives the plans [B, strokes, 4] (m), and the maps before them and after each stroke
-    [strokes + 1, B, H, W] (m), NaN once an outcome is not clean."""
+    """Lets the policy act alone on many goals at once: it pushes its likeliest stroke `strokes` times, whatever comes of it.
+
+    Args:
+      policy: proposes strokes.
+      scene: grid, sand and blade.
+      start, goal: maps [B, H, W] (m).
+      strokes: how many.
+
+    Returns:
+      The plans [B, strokes, 4] (m), and the maps [strokes + 1, B, H, W] (m) before them and after each stroke, NaN from
+      where an outcome is not clean.
+    """
     maps, plans = [start.astype(np.float32)], []
     for _ in range(strokes):
         plans.append(policy.propose(scene, goal, np.nan_to_num(maps[-1]), 1)[0][:, 0])
@@ -43,10 +58,12 @@ def one_after_the_other(
 
 
 def look_ahead(policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, tell: Tell = quiet) -> Ahead:
-    """A beam search: `width` proposals for each of as many plans are pushed, and the `width` closest plans go on whose maps
-    differ. Of all plans up to `strokes` long the closest is put right: none if no stroke brings the sand closer.
+    """Searches for a plan of up to `strokes` strokes with a beam of `width` plans.
 
-    At most N width^2 + 2 N (8 N + 2) + N calls of the simulator for N strokes.
+    For each plan of the beam the policy proposes `width` strokes, which are pushed; the `width` closest plans whose maps
+    differ form the next beam. The closest of all plans, of any length up to `strokes`, is refined by `put_right`; the plan
+    is empty if no stroke brings the sand closer. Takes at most N width^2 + 2 N (8 N + 2) + N calls of the simulator for N
+    strokes.
     """
     start = sand.start.astype(np.float32)
     maps, plans, losses = start[None], np.zeros((1, 0, 4)), np.array([sand.loss_of(start)])
@@ -71,16 +88,24 @@ def look_ahead(policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, t
 
 
 def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray, int]:
-    """A plan [N, 4] (m) near the one given, of finite `loss`, that ends at least as close, and the simulator's calls.
+    """Refines a plan: moves its end points a little, to a plan that ends at least as close to the goal.
 
-    A network sees where a stroke is due to a tenth of a cell; the sand tells more. Each of the plan's 4 N numbers is moved
-    by s up and down, s = 1/4 cell and then 1/10, and with the losses f that these leave all of them go at once to where
-    the parabolas through them are least, and half as far:
+    A network sees where a stroke belongs to a tenth of a cell; the simulator tells more. Each of the plan's 4 N numbers is
+    moved by s up and down, s = 1/4 cell and then 1/10. From the losses f that these moves leave, all numbers are moved at
+    once to the least of the parabolas through them, and half as far:
 
         s (f(-s) - f(s)) / (2 (f(s) - 2 f(0) + f(-s)))   in each number, at most s.
 
-    The closest of all that was tried is taken: 2 N (8 N + 2) calls. Nothing leaves the map: where a move would, it is
-    shorter, and the parabola only about right.
+    The closest plan of all that were tried is taken. Strokes stay on the map: near its edge the moves are shorter, and the
+    parabolas only approximate.
+
+    Args:
+      sand: the loss, its start and its goal.
+      plan: [N, 4] (m).
+      loss: of the plan (m^2), finite.
+
+    Returns:
+      The refined plan [N, 4] (m), and the calls of the simulator, 2 N (8 N + 2).
     """
     if not len(plan):
         return plan, 0
@@ -100,7 +125,10 @@ def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray
 
 
 def _downhill(here: float, up: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Where parabolas through the losses at -1, 0 and 1 are least, -1 to 1; the lower side where they have no least."""
+    """The places, -1 to 1, of the least of parabolas through the losses at -1, 0 and 1.
+
+    Where a parabola has no least, the lower side is taken, or 0 if neither is lower.
+    """
     bend = up - 2 * here + down
     curved = np.isfinite(bend) & (bend > 0)
     least = np.where(curved, down, 0) - np.where(curved, up, 0)
@@ -110,7 +138,7 @@ def _downhill(here: float, up: np.ndarray, down: np.ndarray) -> np.ndarray:
 
 
 def _losses(sand: SandLoss, plan: np.ndarray) -> np.ndarray:
-    """Of the start and after each stroke."""
+    """The losses [N + 1] of the start and after each stroke."""
     maps, losses = sand.start[None].astype(np.float32), [sand.loss_of(sand.start.astype(np.float32))]
     for stroke in plan:
         far, maps = sand.after(maps, stroke[None])
@@ -119,7 +147,7 @@ def _losses(sand: SandLoss, plan: np.ndarray) -> np.ndarray:
 
 
 def _different(far: np.ndarray, maps: np.ndarray, most: int) -> list[int]:
-    """The closest, none of which is within a third of its own distance of one before it."""
+    """Indices of the closest maps, each farther from those before it than a third of its own distance from the goal."""
     kept: list[int] = []
     for i in np.argsort(far, kind="stable"):
         if not np.isfinite(far[i]):

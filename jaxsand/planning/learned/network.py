@@ -1,14 +1,14 @@
-"""The network of the policy that comes with jaxsand: from a goal and the sand to the strokes that are still to be made.
+"""The network of the shipped policy: from a goal and the sand as it lies to the strokes that are still to be made.
 
-A U-Net looks at both maps and gives, for every cell, how likely a stroke that is due starts there, and a query and a key: a
-stroke from cell s ends at cell e with a likelihood in proportion to exp(query(s) . key(e)), so that all pairs of cells are
-compared at once. Ends that belong to strokes are easy to see; which belong together is seen along the line between them, and
-so a second, small network reads what the first makes of the cells on the way and says whether a stroke is due there, and
-where exactly its ends are, as the second stage of a detector does (Ren et al. 2015).
+A U-Net reads both maps and gives three things for every cell: how likely a missing stroke starts there, a query, and a key.
+A stroke from cell s ends at cell e with a likelihood in proportion to exp(query(s) . key(e)), so that all pairs of cells are
+compared at once. The ends of strokes are easy to see, but which two belong together is seen along the line between them. So
+a second, small network reads the U-Net's features along the line, says whether a stroke is missing there, and corrects its
+ends, as the second stage of a detector does (Ren et al. 2015).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,8 @@ from flax import linen as nn
 
 from jaxsand.planning.learned.square_symmetries import turned, turned_back, turned_strokes, turned_strokes_back
 
-Params = Any
+Params = Mapping[str, Any]
+"""The parameters of a flax network: arrays in nested dictionaries."""
 
 _STARTS = 32  # peaks of the starts
 _ENDS = 12  # peaks of the ends from each
@@ -33,9 +34,15 @@ _FARTHEST = 1.5  # cells: an end is moved by less
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Scores:
-    """What the network says of every cell: the log-likelihood that a stroke `start`s there [B, H, W], the `query` and the
-    `key` [B, H, W, K] by which starts find their ends, and what lines see there, `sight` [B, V, H, W, C], in V views, each
-    turned its own way; the last three of its channels are the goal, the sand and their difference."""
+    """What the U-Net says of every cell.
+
+    Attributes:
+      start: log-likelihoods [B, H, W] that a missing stroke starts in a cell.
+      query: [B, H, W, K], of the cells as starts.
+      key: [B, H, W, K], of the cells as ends; see `ends`.
+      sight: features [B, V, H, W, C] that the second network reads along lines, in V views, each turned its own way. The
+        last three channels are the goal, the sand and their difference.
+    """
 
     start: jax.Array
     query: jax.Array
@@ -46,8 +53,12 @@ class Scores:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Lines:
-    """What is seen along strokes: the log-odds [B, P] that such a stroke is `due`, and the `strokes` [B, P, 4] (cells) with
-    their ends put right."""
+    """What the second network says of strokes.
+
+    Attributes:
+      due: log-odds [B, P] that a stroke is still to be made.
+      strokes: [B, P, 4] (cells) with corrected ends.
+    """
 
     due: jax.Array
     strokes: jax.Array
@@ -66,7 +77,7 @@ class _Block(nn.Module):
 
 
 class _Look(nn.Module):
-    """A U-Net on blocks of 2 x 2 cells, so that most of its work is done on a quarter of the cells and fewer."""
+    """The U-Net. It works on blocks of 2 x 2 cells, so that most of its work is done on a quarter of the cells or fewer."""
 
     widths: tuple[int, int, int]
     blocks: tuple[int, int, int]
@@ -100,7 +111,9 @@ class _Look(nn.Module):
 
 
 class _Line(nn.Module):
-    """From what is seen along lines [..., N] to the log-odds, and to the four moves of the ends ahead and to the left."""
+    """The second network: from features along lines [..., N] to the log-odds, and the moves of both ends ahead and to the
+    left.
+    """
 
     @nn.compact
     def __call__(self, seen: jax.Array) -> jax.Array:
@@ -109,8 +122,11 @@ class _Line(nn.Module):
 
 
 class StrokeNet(nn.Module):
-    """Both networks. Maps are [B, H, W] in units of the blade's depth, H and W multiples of 8; strokes are in cells, cell
-    centres at whole numbers and a half. It was trained on 32 x 32 cells."""
+    """Both networks.
+
+    Maps are [B, H, W] in units of the blade's depth, H and W multiples of 8; strokes are in cells, cell centres at whole
+    numbers and a half. It was trained on 32 x 32 cells.
+    """
 
     widths: tuple[int, int, int] = (32, 64, 96)
     blocks: tuple[int, int, int] = (1, 2, 2)
@@ -126,10 +142,11 @@ class StrokeNet(nn.Module):
         return scores, self.along(scores, strokes)
 
     def look(self, goal: jax.Array, current: jax.Array) -> Scores:
+        """The scores of the U-Net alone."""
         return self.eye(goal, current)
 
     def along(self, scores: Scores, strokes: jax.Array) -> Lines:
-        """What is seen along strokes [B, P, 4] (cells); the mean of all views."""
+        """What the second network says of strokes [B, P, 4] (cells), averaged over all views."""
         views, side = scores.sight.shape[1], scores.sight.shape[2]
         every = jnp.stack([turned_strokes(strokes, way, side) for way in range(views)], 1)
         maps = scores.sight[..., -3:-1]
@@ -152,13 +169,21 @@ def _ahead(strokes: jax.Array) -> jax.Array:
 
 
 def _left_of(ahead: jax.Array) -> jax.Array:
-    """Vectors [..., 2] a quarter turn to the left of others."""
+    """Vectors [..., 2] turned to the left by a quarter turn."""
     return jnp.stack([-ahead[..., 1], ahead[..., 0]], -1)
 
 
 def seen_along(sight: jax.Array, strokes: jax.Array, aside: float = 0.0) -> jax.Array:
-    """What lies along strokes [B, V, P, 4] (cells) on maps [B, V, H, W, C], bilinear, from a little before to a little
-    behind, and so far `aside` (cells) to the left: [B, V, P, L, C]."""
+    """Features along strokes, from 1.5 cells before the start to 1.5 cells behind the end, interpolated bilinearly.
+
+    Args:
+      sight: maps [B, V, H, W, C].
+      strokes: [B, V, P, 4] (cells).
+      aside: how far to the left of the strokes (cells).
+
+    Returns:
+      [B, V, P, L, C], L places along each stroke.
+    """
     ahead = _ahead(strokes)[..., None, :]
     a, b = strokes[..., None, :2], strokes[..., None, 2:]
     part = jnp.linspace(0, 1, _ALONG, dtype=sight.dtype)[None, None, None, :, None]
@@ -180,24 +205,25 @@ def seen_along(sight: jax.Array, strokes: jax.Array, aside: float = 0.0) -> jax.
 
 
 def _folded(x: jax.Array, n: int) -> jax.Array:
-    """Blocks of n x n cells as one with n^2 times as many channels."""
+    """Blocks of n x n cells as one cell with n^2 times as many channels."""
     b, h, w, c = x.shape
     return x.reshape(b, h // n, n, w // n, n, c).transpose(0, 1, 3, 2, 4, 5).reshape(b, h // n, w // n, n * n * c)
 
 
 def _unfolded(x: jax.Array, n: int) -> jax.Array:
+    """The inverse of `_folded`."""
     b, h, w, c = x.shape
     c //= n * n
     return x.reshape(b, h, w, n, n, c).transpose(0, 1, 3, 2, 4, 5).reshape(b, h * n, w * n, c)
 
 
 def _log_share(score: jax.Array) -> jax.Array:
-    """Scores [..., H, W] as logarithms of shares of 1."""
+    """Scores [..., H, W] as logarithms of shares that sum to 1 over the map."""
     return score - jax.nn.logsumexp(score, (-2, -1), keepdims=True)
 
 
 def spread(points: jax.Array, shape: tuple[int, int]) -> jax.Array:
-    """Points [..., 2] = x, y (cells) as shares of the cells around: [..., H, W]."""
+    """Points [..., 2] = x, y (cells) as weights [..., H, W] of the four cells around each; the weights sum to 1."""
     rows, columns = shape
     x = jnp.clip(points[..., 0, None] - 0.5, 0, columns - 1)
     y = jnp.clip(points[..., 1, None] - 0.5, 0, rows - 1)
@@ -207,7 +233,7 @@ def spread(points: jax.Array, shape: tuple[int, int]) -> jax.Array:
 
 
 def _counted(count: int, like: jax.Array) -> jax.Array:
-    """0, 1, 2, ... along the last axis of as many axes."""
+    """0, 1, ..., count - 1 along the last axis of an array with as many axes as `like`."""
     return jnp.arange(count, dtype=like.dtype).reshape(*[1] * (like.ndim - 1), count)
 
 
@@ -219,7 +245,7 @@ def ends(scores: Scores, starts: jax.Array) -> jax.Array:
 
 
 def symmetric(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Array) -> Scores:
-    """The network's scores of square maps, averaged (as logarithms) over the eight turns and mirrors of a square."""
+    """The U-Net's scores of square maps, averaged (as logarithms) over the eight turns and mirrors of a square."""
     ways = range(8)
     views = (jnp.concatenate([turned(maps, way) for way in ways]) for maps in (goal, current))
     every: Any = net.apply(params, *views, method="look")
@@ -234,7 +260,7 @@ Judge = Callable[[Scores, jax.Array], Lines]
 
 
 def judge(net: StrokeNet, params: Params) -> Judge:
-    """What the network sees along strokes [B, P, 4] (cells)."""
+    """The second network as a function of scores and strokes [B, P, 4] (cells)."""
 
     def along(scores: Scores, strokes: jax.Array) -> Lines:
         lines: Any = net.apply(params, scores, strokes, method="along")
@@ -244,12 +270,17 @@ def judge(net: StrokeNet, params: Params) -> Judge:
 
 
 def likeliest(along: Judge, scores: Scores, count: int) -> tuple[jax.Array, jax.Array]:
-    """The `count` likeliest strokes [B, count, 4] (cells), none like another, and their scores [B, count]:
+    """The `count` likeliest strokes, no two alike.
+
+    A stroke's score is
 
         log sigmoid(due) + 0.3 [log p(start) + log p(end | start)],
 
-    with p of the blocks of 3 x 3 cells around peaks. The means of the likelihoods in these blocks are a stroke's ends, until
-    what is seen along it puts them right.
+    with p summed over blocks of 3 x 3 cells around peaks. A stroke's ends are first the means of the likelihoods in these
+    blocks; the second network then corrects them.
+
+    Returns:
+      The strokes [B, count, 4] (cells), likeliest first, and their scores [B, count].
     """
     strokes, log_shares = jax.lax.map(_candidates, scores)
     lines = along(scores, strokes)
@@ -267,7 +298,7 @@ def likeliest(along: Judge, scores: Scores, count: int) -> tuple[jax.Array, jax.
 
 
 def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
-    """The likeliest strokes between peaks, of one map: [96, 4] (cells), and the logarithms of their likelihoods."""
+    """The 96 likeliest strokes between peaks of one map, [96, 4] (cells), and the logarithms of their likelihoods."""
     begin = jnp.exp(scores.start)
     p, first = _peaks(begin, _STARTS)
     a = jax.vmap(lambda cell: _centre(begin, cell))(first)
@@ -283,14 +314,14 @@ def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
 
 
 def _peaks(share: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    """The sums over the blocks of 3 x 3 cells around the largest peaks of these sums, and the peaks' cells."""
+    """The `count` largest local maxima of the sums over blocks of 3 x 3 cells, and their cells."""
     block = jax.lax.reduce_window(share, 0.0, jax.lax.add, (3, 3), (1, 1), "SAME")
     peak = block >= jax.lax.reduce_window(block, -jnp.inf, jax.lax.max, (3, 3), (1, 1), "SAME")
     return jax.lax.top_k(jnp.where(peak, block, 0).ravel(), count)
 
 
 def _centre(share: jax.Array, cell: jax.Array) -> jax.Array:
-    """The mean place x, y (cells) of the shares [H, W] in the block around a cell."""
+    """The mean place x, y (cells) of the shares [H, W] in the block of 3 x 3 cells around a cell."""
     rows, columns = share.shape
     y, x = jnp.meshgrid(jnp.arange(rows), jnp.arange(columns), indexing="ij")
     near = (jnp.abs(y - cell // columns) <= 1) & (jnp.abs(x - cell % columns) <= 1)

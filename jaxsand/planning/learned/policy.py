@@ -1,4 +1,4 @@
-"""A policy that is shown a goal and the sand, and says where to push next."""
+"""A policy that sees a goal and the sand, and proposes where to push next."""
 
 import json
 import math
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from jaxsand.planning.learned.network import StrokeNet, judge, likeliest, symmetric
+from jaxsand.planning.learned.network import Params, StrokeNet, judge, likeliest, symmetric
 from jaxsand.scene.scene import Scene, blade_of
 
 SIDE = 32
@@ -25,22 +25,33 @@ SIDE = 32
 _STRIDE = 16  # between the looks at a larger map
 _SIZES = (1, 8, 64)  # of batches, so that a few programs serve all
 _FILE = "policy.npz"
+_REMEDY = (
+    "reinstall jaxsand for the one that it ships, or train one in a checkout of its repository, which has the learners "
+    "(python -m train hindsight)"
+)
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A network and its parameters. Made by `python -m train hindsight`; `load_policy()` gives the one that jaxsand ships.
+    """A network and its parameters; `load_policy()` gives the one that comes with jaxsand.
 
-    It learned on maps of 32 x 32 cells with blades about two cells wide; larger maps are looked at part by part, smaller
-    ones are padded with level sand.
+    It was trained on maps of 32 x 32 cells with blades about two cells wide. A larger map is read part by part, and a
+    smaller one is padded with level sand. Training takes a checkout of the repository: `python -m train hindsight`.
     """
 
     net: StrokeNet
-    params: Any
+    params: Params
 
     def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """The `count` likeliest next strokes [B, count, 4] (m), likeliest first, for goals and current maps [B, H, W] (m),
-        and the logarithms of their likelihoods [B, count].
+        """Proposes the likeliest next strokes for a batch of goals.
+
+        Args:
+          scene: grid, sand and a `Blade` that digs.
+          goal, current: maps [B, H, W] (m).
+          count: how many strokes for each.
+
+        Returns:
+          The strokes [B, count, 4] (m), likeliest first, and the logarithms of their likelihoods [B, count].
 
         Raises:
           ValueError: for a scene without a blade, or one that does not dig.
@@ -68,8 +79,9 @@ def in_batches(
     current: np.ndarray,
     sizes: Sequence[int],
 ) -> tuple[np.ndarray, ...]:
-    """What `read` makes of maps [B, ...], in batches of a few `sizes`, filled up with level sand: few programs serve any
-    number."""
+    """Calls `read` on maps [B, ...] in batches of a few `sizes`, filled up with level sand, so that few programs are
+    compiled.
+    """
     out, first = [], 0
     while first < len(goal):
         left = len(goal) - first
@@ -83,12 +95,13 @@ def in_batches(
 
 
 @partial(jax.jit, static_argnames=("net", "count"))
-def _read(net: StrokeNet, params: Any, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _read(net: StrokeNet, params: Params, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The `count` likeliest strokes [B, count, 4] (cells) and their scores [B, count]."""
     return likeliest(judge(net, params), symmetric(net, params, goal, current), count)
 
 
-def save_policy(policy: Policy, path: Path, **about: Any) -> None:
-    """Writes a policy in half precision, with what is to be known `about` it, as numbers and text."""
+def save_policy(policy: Policy, path: Path, **about: float | str) -> None:
+    """Writes a policy in half precision, with notes `about` it, which are numbers and text."""
     flat = traverse_util.flatten_dict(policy.params, sep="/")
     arrays: dict[str, Any] = {name: np.asarray(x, np.float16) for name, x in flat.items()}
     fields = {name: getattr(policy.net, name) for name in ("widths", "blocks", "features", "sights")}
@@ -97,7 +110,7 @@ def save_policy(policy: Policy, path: Path, **about: Any) -> None:
 
 
 def load_policy(path: Path | None = None) -> Policy:
-    """The policy in a file, or the one that comes with jaxsand.
+    """Loads the policy in a file, or the one that comes with jaxsand.
 
     Raises:
       ValueError: if there is none, or it cannot be read.
@@ -106,7 +119,7 @@ def load_policy(path: Path | None = None) -> Policy:
 
 
 def about_policy(path: Path | None = None) -> dict[str, Any]:
-    """What its maker noted: its command, the minutes it took, and what it reached on goals of random strokes."""
+    """The notes of a policy's maker: the command, the minutes it took, and what it reached on goals of random strokes."""
     with resources.as_file(resources.files("jaxsand").joinpath("data", _FILE)) as own, np.load(path or own) as data:
         known: dict[str, Any] = json.loads(str(data["about"]))
         return known
@@ -125,18 +138,14 @@ def _loaded(path: Path) -> Policy:
             flat = {name: jnp.asarray(data[name], jnp.float32) for name in data.files if name != "about"}
         net = StrokeNet(tuple(fields["widths"]), tuple(fields["blocks"]), fields["features"], fields["sights"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
-        raise ValueError(
-            f"policy: cannot read {path} ({type(error).__name__}); train one: python -m train hindsight"
-        ) from None
+        raise ValueError(f"policy: cannot read {path} ({type(error).__name__}); {_REMEDY}") from None
     if {name: x.shape for name, x in flat.items()} != _shapes(net):
-        raise ValueError(
-            f"policy: {path} holds no parameters of this version's network; train one: python -m train hindsight"
-        )
+        raise ValueError(f"policy: {path} holds no parameters of this version's network; {_REMEDY}")
     return Policy(net, traverse_util.unflatten_dict(flat, sep="/"))
 
 
 def _shapes(net: StrokeNet) -> dict[str, tuple[int, ...]]:
-    """Of the network's parameters."""
+    """The shapes of a network's parameters by name."""
     maps = jax.ShapeDtypeStruct((1, SIDE, SIDE), jnp.float32)
     params = jax.eval_shape(net.init, jax.random.key(0), maps, maps, jax.ShapeDtypeStruct((1, 1, 4), jnp.float32))
     return {name: x.shape for name, x in traverse_util.flatten_dict(params, sep="/").items()}
@@ -150,11 +159,12 @@ def _depth(scene: Scene) -> float:
 
 
 def _looks(shape: Sequence[int]) -> list[tuple[int, int]]:
-    """First rows and columns of the parts of a map that are looked at."""
+    """The first rows and columns of the parts of a map that are read one by one."""
     firsts = [np.linspace(0, max(n - SIDE, 0), math.ceil(max(n - SIDE, 0) / _STRIDE) + 1).round().astype(int) for n in shape]
     return [(int(r), int(c)) for r in firsts[0] for c in firsts[1]]
 
 
 def _part(maps: np.ndarray, row: int, column: int) -> np.ndarray:
+    """The part of maps that begins at a row and a column, padded with level sand to the network's size."""
     part = maps[:, row : row + SIDE, column : column + SIDE]
     return np.pad(part, [(0, 0), *((0, SIDE - n) for n in part.shape[1:])])

@@ -1,4 +1,4 @@
-"""From a policy to a plan: by itself, or looking ahead with the simulator, then by gradients; each stage can be left out."""
+"""From a policy to a plan: the policy alone, or with look-ahead, then with gradients. Both of these can be left out."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,12 @@ from jaxsand.scene.progress import Tell, quiet
 
 @dataclass(frozen=True)
 class Stages:
-    """What follows the policy: a beam of so many plans that are tried on the sand, its `width` (0: none), the best of
-    which is put right, and gradients at a cost of `polish` calls of the simulator (0: none)."""
+    """What follows the policy.
+
+    Attributes:
+      width: plans in the beam that looks ahead with the simulator; 0 leaves look-ahead out.
+      polish: calls of the simulator that gradients may spend on the plan; 0 leaves them out.
+    """
 
     width: int = 0
     polish: int = 0
@@ -21,7 +25,14 @@ class Stages:
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan `strokes` [N, 4] (m), the squared distances `before` and `after` (m^2), and the simulator's `calls`."""
+    """A plan by the policy.
+
+    Attributes:
+      strokes: [N, 4] (m).
+      before: squared distance (m^2) of the start from the goal.
+      after: squared distance (m^2) after the strokes.
+      calls: how often the simulator was called.
+    """
 
     strokes: np.ndarray
     before: float
@@ -36,10 +47,10 @@ def plan_by_policy(
     stages: Stages = Stages(),
     tell: Tell = quiet,
 ) -> Planned:
-    """At most so many strokes towards the goal.
+    """Plans at most `strokes` strokes towards the goal.
 
-    The policy alone makes them all, whatever comes of it; with look-ahead a plan ends where nothing brings the sand closer.
-    Gradients start from that plan, and theirs is taken if it ends closer.
+    The policy alone makes all of them, whatever comes of it; with look-ahead a plan ends where nothing brings the sand
+    closer. Gradients start from that plan, and their plan is taken if it ends closer.
     """
     before = sand.loss_of(sand.start)
     if stages.width:

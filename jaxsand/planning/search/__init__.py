@@ -1,4 +1,4 @@
-"""Planning on real sand: every child is a height map that the simulator rolled out."""
+"""Planning on real sand: a search in which every child is a height map that the simulator made."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,12 +19,23 @@ from jaxsand.scene.scene import Scene, as_array, fit
 
 @dataclass(frozen=True)
 class SandPlan:
-    """Paths for the tool, which is lifted in between, and what they leave.
+    """What `plan_sand` found.
 
-    `height` [H, W] is what `follow` makes of them one after the other; `before` and `after` are the l2 distances from the
-    goal (m). `lower_bound` is proven (see `reach`): no plan of as many strokes gets closer; `estimate` is what is left if
-    every stroke gains as much as the best one of all that were tried, which is measured and no proof. `gap` is what lies
-    between the plan and its bound.
+    Attributes:
+      paths: points [n, 2] = x, y (m) of each path, in order; the tool is lifted between paths.
+      height: the map [H, W] (m) that `follow` makes of the paths, one after the other.
+      before: l2 distance (m) of the start from the goal, sqrt(sum (h - goal)^2).
+      after: l2 distance (m) of `height` from the goal.
+      lower_bound: proven: no plan of as many strokes comes closer than this (m).
+      estimate: a guess (m) of what could be reached: what is left if every stroke gains as much as the best of all that were
+        tried.
+      effort: how many pushes were simulated, in full and roughly.
+
+    Example:
+      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
+      >>> found = js.plan_sand(scene, np.zeros((16, 16)), np.zeros((16, 16)), strokes=1)
+      >>> found.strokes.shape, found.gap, found.reduction
+      ((0, 4), 0.0, 0.0)
     """
 
     paths: tuple[Path, ...]
@@ -61,16 +72,41 @@ def plan_sand(
     budget: int = 4000,
     seed: int = 0,
 ) -> SandPlan:
-    """At most so many strokes that bring a map [H, W] (m) at rest close to a goal [H, W], by search on real sand.
+    """Searches for strokes that bring a map close to a goal, by trying them on simulated sand.
 
-    Layers of best-first search in which a node is a height map (with `Steps`, and the tool's place), its children are
-    rolled out hundreds at once, and nodes that look alike are one; strokes of a `Lattice` (the default) are then varied one
-    at a time. Strokes from the binary plan (`plan`, on blocks as wide as the blade) are among the children.
-    `budget` counts full pushes, rough ones at `rollouts.CHEAP` each; equal seeds give equal plans.
+    The search is best-first in layers: the nodes of layer k are maps after k strokes (with `Steps`, and the tool's place).
+    Hundreds of children are simulated at once, and nodes whose maps look alike are merged. The runs of the binary plan
+    (`plan`, on blocks as wide as the blade) are among the children. With a `Lattice`, the best plans' strokes are then
+    varied one at a time.
+
+    Args:
+      scene: grid, sand and a `Blade`.
+      height: the map [H, W] (m) to start from, at rest; `height[i, j]` is at x = (j + 1/2) dx, y = (i + 1/2) dx.
+      goal: [H, W] (m).
+      strokes: the largest number of strokes, or of legs.
+      actions: `Lattice()` for strokes with the tool lifted in between (the default), `Steps()` for one path with the tool
+        down.
+      budget: how many full pushes the search may cost; a rough push counts as 1/12.
+      seed: equal seeds give equal plans.
+
+    Returns:
+      A `SandPlan`; it has no paths where nothing brings the sand closer to the goal.
 
     Raises:
       ValueError: for a scene without a blade, maps that do not fit it or are not at rest, or options out of range.
       OutcomeError: if the sand does not come to rest.
+
+    Example:
+      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
+      >>> js.plan_sand(scene, np.zeros((16, 16)), np.zeros((16, 16)), strokes=1).paths
+      ()
+      >>> goal = np.zeros((16, 16))
+      >>> goal[8, 4:12] = -0.004
+      >>> found = js.plan_sand(scene, np.zeros((16, 16)), goal, strokes=1, budget=8)  # doctest: +SKIP
+      >>> found.after < found.before  # doctest: +SKIP
+      True
+
+    The last lines are not run by the tests: compiling takes 20 s.
     """
     actions = Lattice() if actions is None else actions
     height, goal = _checked(scene, height, goal)

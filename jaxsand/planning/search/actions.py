@@ -13,10 +13,18 @@ Path = np.ndarray  # [n, 2]: x, y (m)
 
 @dataclass(frozen=True)
 class Lattice:
-    """Straight strokes, the tool lifted in between; lengths in spacings.
+    """Tells `plan_sand` to use straight strokes, the tool lifted in between.
 
-    They are proposed with both ends on a lattice of `pitch`, from `shortest` to `longest`, and then moved off it where that
-    brings the sand closer; none becomes longer than `longest`.
+    Strokes are proposed with both ends on a lattice, and moved off it later where that brings the sand closer to the goal.
+
+    Args:
+      pitch: distance between the lattice's points, in grid spacings.
+      shortest: the shortest stroke that is proposed, in grid spacings.
+      longest: the longest stroke that is proposed or made, in grid spacings.
+
+    Example:
+      >>> js.Lattice(pitch=2.0).longest
+      inf
     """
 
     pitch: float = 1.0
@@ -26,9 +34,17 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Steps:
-    """One path with the tool down, in legs of `cell` grid cells north, east, south or west.
+    """Tells `plan_sand` to use one path with the tool down, in legs north, east, south or west.
 
-    The corners are the centres of the blocks of `cell` x `cell` grid cells that fit within `margin` grid cells of the edge.
+    Corners are the centres of the blocks of `cell` x `cell` grid cells that fit on the map within the margin.
+
+    Args:
+      cell: length of a leg, in grid cells.
+      margin: grid cells along the map's edge that the blocks keep clear of.
+
+    Example:
+      >>> js.Steps(cell=3, margin=1)
+      Steps(cell=3, margin=1)
     """
 
     cell: int = 6
@@ -40,7 +56,15 @@ Actions = Lattice | Steps
 
 @dataclass(frozen=True)
 class Job:
-    """A scene, a map [H, W] (m) at rest, a goal [H, W], and how many strokes or legs at most, of which kind."""
+    """A search to make.
+
+    Attributes:
+      scene: grid, sand and blade.
+      height: the map [H, W] (m) to start from, at rest.
+      goal: [H, W] (m).
+      strokes: the largest number of strokes or legs.
+      actions: their kind.
+    """
 
     scene: Scene
     height: np.ndarray
@@ -50,7 +74,7 @@ class Job:
 
 
 def longest_stroke(scene: Scene, actions: Actions) -> float:
-    """The longest stroke or leg that there is (m)."""
+    """The length of the longest stroke or leg that is allowed (m)."""
     spacing = float(scene.grid.spacing)
     if isinstance(actions, Steps):
         return actions.cell * spacing
@@ -60,10 +84,10 @@ def longest_stroke(scene: Scene, actions: Actions) -> float:
 def propose(
     scene: Scene, actions: Lattice, height: np.ndarray, goal: np.ndarray, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Random strokes [count, 4] (m) on the lattice that may bring `height` closer to `goal`.
+    """Draws random strokes [count, 4] (m) on the lattice that may bring `height` [H, W] closer to `goal` [H, W].
 
-    Starts lie where there is too much sand, ends where there is too little, where there is too much, or anywhere, in equal
-    shares; a fourth share lies anywhere.
+    A quarter of the strokes each run from too much sand to too little, from too much to too much, from too much to anywhere,
+    and from anywhere to anywhere.
     """
     spacing = float(scene.grid.spacing)
     points = _lattice(scene, actions)
@@ -86,8 +110,7 @@ def propose(
 
 
 def moved(scene: Scene, actions: Lattice, strokes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Strokes [n, 4] (m), each with its start, its end, both alike or both apart moved by a few hundredths of a spacing to a
-    few spacings."""
+    """Moves strokes [n, 4] (m) at random, by about 0.05 to 3 spacings: by the start, the end, both alike, or both apart."""
     size = float(scene.grid.spacing) * np.exp(rng.uniform(np.log(0.05), np.log(3), (len(strokes), 1)))
     start, end = (rng.normal(size=(len(strokes), 2)) * size for _ in range(2))
     way = rng.integers(0, 4, (len(strokes), 1))
@@ -96,7 +119,7 @@ def moved(scene: Scene, actions: Lattice, strokes: np.ndarray, rng: np.random.Ge
 
 
 def confined(scene: Scene, actions: Lattice, strokes: np.ndarray) -> np.ndarray:
-    """Strokes with both ends on the map and no longer than allowed."""
+    """Strokes [n, 4] (m) with both ends moved onto the map, and shortened to the allowed length."""
     spacing = float(scene.grid.spacing)
     rows, columns = scene.grid.shape
     low, high = spacing / 2, (np.array([columns, rows, columns, rows]) - 0.5) * spacing
@@ -109,7 +132,9 @@ def confined(scene: Scene, actions: Lattice, strokes: np.ndarray) -> np.ndarray:
 
 
 def corners(scene: Scene, steps: Steps, offset: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """Where a path of steps may turn: [rows, columns, 2] of x, y (m), row 0 at the bottom; `offset` rows and columns up."""
+    """Where a path of steps may turn: [rows, columns, 2] of x, y (m), row 0 at y = 0; the blocks begin `offset` (row,
+    column) later.
+    """
     y, x = (
         (steps.margin + o + (np.arange((n - 2 * steps.margin - o) // steps.cell) + 0.5) * steps.cell)
         * float(scene.grid.spacing)
@@ -119,6 +144,7 @@ def corners(scene: Scene, steps: Steps, offset: tuple[int, int] = (0, 0)) -> np.
 
 
 def _lattice(scene: Scene, actions: Lattice) -> np.ndarray:
+    """The lattice's points [n, 2] = x, y (m)."""
     step = actions.pitch * float(scene.grid.spacing)
     rows, columns = (max(1, int(n / actions.pitch + 1e-9)) for n in scene.grid.shape)
     x, y = np.meshgrid((np.arange(columns) + 0.5) * step, (np.arange(rows) + 0.5) * step)
@@ -126,11 +152,12 @@ def _lattice(scene: Scene, actions: Lattice) -> np.ndarray:
 
 
 def _shares(amount: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Positive amounts as shares that sum to 1; `otherwise` where none is positive."""
     amount = np.maximum(amount, 0)
     return amount / amount.sum() if amount.sum() > 0 else otherwise
 
 
 def _blurred(height: np.ndarray) -> np.ndarray:
-    """The mean of each cell, twice, and its four neighbours."""
+    """Each cell averaged with its four neighbours, its own height counted twice."""
     p = np.pad(np.asarray(height, float), 1, mode="edge")
     return (2 * p[1:-1, 1:-1] + p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 6

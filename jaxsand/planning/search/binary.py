@@ -15,10 +15,13 @@ _HINTS = 24
 def binary_paths(
     scene: Scene, height: np.ndarray, goal: np.ndarray, steps: Steps, offset: tuple[int, int] = (0, 0), part: float = 0.5
 ) -> list[np.ndarray]:
-    """The walks of the binary plan, one over each piece to dig: rows and columns [n, 2] of `corners(scene, steps, offset)`.
+    """The walks of the binary plan, one over each connected piece to dig.
 
-    A block of cells is to be dug where the goal lies below the map by more than `part` of what there is to dig at most: the
-    blade's depth, or the deepest cut where that is deeper.
+    A block of cells is dug where the goal lies below the map by more than `part` of the deepest cut, which is the blade's
+    depth or more.
+
+    Returns:
+      For each piece the rows and columns [n, 2] of `corners(scene, steps, offset)` that the walk passes.
     """
     rows, columns = corners(scene, steps, offset).shape[:2]
     top, left = (steps.margin + o for o in offset)
@@ -36,7 +39,7 @@ def binary_paths(
 
 
 def straight_runs(walk: np.ndarray) -> list[tuple[int, int]]:
-    """Where the straight runs of a walk [n, 2] begin and end."""
+    """The first and the last index of each straight run of a walk [n, 2]."""
     turns = [0, *(np.flatnonzero(np.any(np.diff(walk, 2, axis=0), axis=1)) + 1).tolist(), len(walk) - 1]
     return [(a, b) for a, b in pairwise(turns) if b > a]
 
@@ -44,7 +47,7 @@ def straight_runs(walk: np.ndarray) -> list[tuple[int, int]]:
 def binary_strokes(
     scene: Scene, height: np.ndarray, goal: np.ndarray, offset: tuple[int, int] = (0, 0), part: float = 0.5
 ) -> np.ndarray:
-    """The straight runs of the binary plan on blocks as wide as the blade: [n, 4] (m), in order."""
+    """The straight runs of the binary plan, on blocks as wide as the blade: [n, 4] (m), in order."""
     steps = Steps(blade_cells(scene))
     at = corners(scene, steps, offset)
     walks = binary_paths(scene, height, goal, steps, offset, part)
@@ -53,7 +56,7 @@ def binary_strokes(
 
 
 def binary_hints(job: Job) -> np.ndarray:
-    """Strokes [n, 4] (m) that the binary plan suggests, with its blocks at any offset: the longest that are allowed."""
+    """The longest strokes [n, 4] (m) that the binary plan suggests, with its blocks at every offset."""
     cells = range(blade_cells(job.scene))
     found = [binary_strokes(job.scene, job.height, job.goal, (row, column)) for row in cells for column in cells]
     runs = np.unique(np.concatenate(found), axis=0)

@@ -1,15 +1,15 @@
-"""How much a stroke can change a map at the very most, and so how close to a goal a number of strokes can come at best.
+"""How much a stroke can change a map at most, and so how close to a goal a number of strokes can come.
 
-Settling is the gradient flow of a convex function of the heights, so that it brings no two maps farther apart in l2; and
-with rates in the stable range it keeps the order of maps (h <= h' everywhere stays so) and their volume, so that it brings
-no two farther apart in l1. Order is what counts here. Let h be a map at rest, S the cells that the blade covers in some
+Settling is the gradient flow of a convex function of the heights, so it brings no two maps farther apart in l2. With rates
+in the stable range it also keeps the order of maps (if h <= h' everywhere, this stays so) and their volume, so it brings no
+two farther apart in l1. The argument uses the order. Let h be a map at rest, S the cells that the blade covers in some
 strokes, -d the height of its bottom and mu = tan(angle of repose). Then
 
     u(x) = min(h(x), -d + mu dist(x, S))
 
-is at rest too, since neither part is steeper than mu, and whatever these strokes do, the map stays above it: the blade takes
-only what lies above -d in the cells it covers, sand set down raises the map, and settling, with a blade in the way or
-without, keeps it above u, which does not move. So n strokes that each cover some S_k lower the map by no more than
+is at rest too, since neither part is steeper than mu. Whatever these strokes do, the map stays above u: the blade takes only
+what lies above -d in the cells it covers, sand set down raises the map, and settling, with a blade in the way or without,
+keeps it above u, which does not move. So n strokes that cover S_1, ..., S_n lower the map by no more than
 
     sum (h - h')+  <=  sum max_k (h - u_k)  <=  n A,    A = max over strokes of sum (h - u)
 
@@ -28,12 +28,21 @@ from jaxsand.scene.tools import Blade
 
 
 def least_distance(scene: Scene, height: np.ndarray, goal: np.ndarray, strokes: int, longest: float) -> float:
-    """No plan of at most so many strokes, each at most `longest` (m), brings `height`, at rest, closer to `goal` in l2 (m).
+    """A proven lower bound (m) of the l2 distance from `goal` after at most `strokes` strokes from `height`, which is at
+    rest.
 
-        min |h + v - g|_2   with   sum v-  <=  n A,   sum v+  <=  n A,   v-  <=  (h + d)+
+    It is the solution of
 
-    whose answer cuts surplus and lack off at one level each. Where no sand drains, it is also no closer than the difference
-    of the mean heights over all cells. For isotropic sand, whose A is not proven, that alone counts.
+        min |h + v - g|_2   with   sum v-  <=  n A,   sum v+  <=  n A,   v-  <=  (h + d)+,
+
+    which cuts surplus and lack off at one level each. Where no sand drains, the distance is also at least that of the
+    mean heights, over all cells. For isotropic sand, whose A is not proven, only the latter is used.
+
+    Args:
+      scene: grid, sand and blade.
+      height, goal: maps [H, W] (m).
+      strokes: n.
+      longest: the longest stroke allowed (m).
     """
     surplus = np.asarray(height, float) - np.asarray(goal, float)
     uneven = abs(surplus.sum()) / math.sqrt(surplus.size) if isinstance(scene.edge, Closed) else 0.0
@@ -48,9 +57,9 @@ def least_distance(scene: Scene, height: np.ndarray, goal: np.ndarray, strokes: 
 def most_lowered(scene: Scene, height: np.ndarray, longest: float) -> float:
     """A: by how much one stroke of at most `longest` (m) can lower a map at rest, summed over the cells (m).
 
-    Every stroke lies within a rectangle of the full length about the stroke's middle. Of these, those with the middle on a
-    lattice of half a spacing and 64 headings are tried; no other lies farther off than
-    delta = sqrt(2) dx / 4 + (half the rectangle's diagonal) (pi / 128), which the distance to S is shortened by.
+    Every stroke lies within a rectangle of the full length about the stroke's middle. Rectangles are tried with the middle
+    on a lattice of half a spacing and with 64 headings. Any other lies at most delta = sqrt(2) dx / 4 + (half the
+    rectangle's diagonal) (pi / 128) off one of these, so the distance to S is shortened by delta.
     """
     width, thickness, depth = blade_size(scene)
     dx = float(scene.grid.spacing)
@@ -83,7 +92,7 @@ def blade_size(scene: Scene) -> tuple[float, float, float]:
 
 
 def _cut_off(excess: np.ndarray, at_most: np.ndarray | float, amount: float) -> np.ndarray:
-    """What is left of `excess`, least in l2, when `amount` in all and `at_most` of each may be taken away."""
+    """What is left of `excess`, least in l2, when `amount` in all and at most `at_most` of each cell may be taken away."""
     taken = np.minimum(excess, at_most)
     if taken.sum() <= amount:
         return excess - taken

@@ -1,7 +1,6 @@
-"""The children of a search on real sand, evaluated by rolling out the simulator, many at once."""
+"""Simulates the children of a search on real sand, many at once."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from jaxsand.interaction.batched import act_batch, step_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.simulate import check, follow
 from jaxsand.planning.search.actions import Path
-from jaxsand.relaxation.settling import settle_batch
+from jaxsand.relaxation.settling import Settled, settle_batch
 from jaxsand.relaxation.stopping import Sweeps
 from jaxsand.scene.scene import Scene
 
@@ -19,7 +18,13 @@ CHEAP = 1 / 12
 
 @dataclass(frozen=True)
 class Effort:
-    """Simulator calls: `full` and `rough` pushes; `gain` is the largest step towards the goal of any full one, in l2 (m)."""
+    """What a search cost.
+
+    Attributes:
+      full: full pushes.
+      rough: rough pushes.
+      gain: the largest step of a full push towards the goal, in l2 (m).
+    """
 
     full: int = 0
     rough: int = 0
@@ -27,7 +32,7 @@ class Effort:
 
     @property
     def cost(self) -> float:
-        """In full pushes."""
+        """The cost in full pushes; a rough one counts as `CHEAP`."""
         return self.full + CHEAP * self.rough
 
     def __add__(self, other: "Effort") -> "Effort":
@@ -41,16 +46,16 @@ def distance(maps: np.ndarray, goal: np.ndarray) -> np.ndarray:
 
 
 def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
-    """What one stroke [n, 4] each makes of maps [n, H, W]; NaN where the outcome is not clean.
+    """The maps [n, H, W] (m) after one stroke [n, 4] (m) on each of `maps` [n, H, W]; NaN where an outcome is not clean.
 
     Raises:
-      OutcomeError: if none of a batch is clean.
+      OutcomeError: if no outcome of the batch is clean.
     """
     return _clean(step_batch(scene, *_single(maps, strokes)))
 
 
 def replay(scene: Scene, height: np.ndarray, paths: list[Path] | tuple[Path, ...]) -> np.ndarray:
-    """The map [H, W] after paths one after the other, each from where the tool is lowered to where it is lifted."""
+    """The map [H, W] (m) after the paths, one after the other; the tool is lowered and lifted for each."""
     height = np.asarray(height, np.float32)
     for path in paths:
         shaped = follow(scene, height, np.asarray(path, np.float32))
@@ -60,21 +65,23 @@ def replay(scene: Scene, height: np.ndarray, paths: list[Path] | tuple[Path, ...
 
 
 def roughly_pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
-    """`pushed` in closed form and with 8 sweeps of settling: to rank by, not to judge by."""
+    """Like `pushed`, in closed form and with 8 sweeps of settling: good enough to rank strokes, not to judge them."""
     return np.asarray(step_batch(scene, *_single(maps, strokes), push=SwathPush(), stop=Sweeps(8)).height)
 
 
 def walked(scene: Scene, maps: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Maps [n, H, W] with the tool down after one more leg [n, 4] each, and the same with the tool lifted and settled.
+    """One more leg [n, 4] (m) on each of the maps [n, H, W] with the tool down.
 
-    The tool comes down again at the start of a leg, where it had stood; `follow` of the whole path settles a little less.
+    Returns:
+      The maps with the tool still down, and the maps with the tool lifted and the sand settled. The tool comes down again at
+      the start of each leg, where it had stood; `follow` of the whole path settles a little less.
     """
     down = act_batch(scene, *_single(maps, legs)).height
     return np.asarray(down), _clean(settle_batch(scene, down))
 
 
 def distinct(marks: list[bytes], parent: np.ndarray, order: np.ndarray, count: int, most: int) -> list[int]:
-    """The first `count` nodes in the given order of which no two bear the same mark, and no more than `most` of a parent."""
+    """The first `count` nodes in the given order, at most `most` of one parent, and no two with the same mark."""
     kept: list[int] = []
     seen: set[bytes] = set()
     children = dict.fromkeys(parent.tolist(), 0)
@@ -87,14 +94,15 @@ def distinct(marks: list[bytes], parent: np.ndarray, order: np.ndarray, count: i
 
 
 def marks(maps: np.ndarray, grain: float) -> list[bytes]:
-    """What maps [n, H, W] are told apart by: means over blocks of 2 x 2 cells, rounded to multiples of `grain` (m)."""
+    """A label for each of maps [n, H, W]: means over blocks of 2 x 2 cells, rounded to multiples of `grain` (m)."""
     rows, columns = (n // 2 * 2 for n in maps.shape[1:])
     blocks = maps[:, :rows, :columns].reshape(len(maps), rows // 2, 2, columns // 2, 2).mean((2, 4))
     rounded = np.round(np.where(np.isfinite(blocks), blocks, 0) / grain).astype(np.int32)
     return [one.tobytes() for one in rounded]
 
 
-def _clean(result: Any) -> np.ndarray:
+def _clean(result: Settled) -> np.ndarray:
+    """The maps of a batch, NaN where the outcome is not clean."""
     good = np.asarray(result.outcome) == 0
     if not good.any():
         check(result)

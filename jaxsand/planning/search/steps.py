@@ -1,4 +1,4 @@
-"""The search over paths with the tool down: layers of real maps, each with the place where the tool stands."""
+"""The search over paths with the tool down, in layers of maps; each node also has the place where the tool stands."""
 
 import jax
 import numpy as np
@@ -18,7 +18,11 @@ Places = np.ndarray  # [n, 2]: row and column of corners
 def search_steps(job: Job, hint: Places, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
     """The best path found for a job, at a cost of about `budget` full pushes of one leg each.
 
-    The places of the path `hint` are kept in every layer as far as they go, and the whole is judged with the others.
+    The path `hint` (rows and columns of corners [n, 2]) is kept in every layer as far as it goes, and judged with the
+    others.
+
+    Returns:
+      One path [n, 2] (m), or none if no path brings the sand closer; and what the search cost.
     """
     del rng  # nothing is drawn
     width = max(1, int((budget - _JUDGED * job.strokes) / (4 * job.strokes)))
@@ -33,11 +37,20 @@ def search_steps(job: Job, hint: Places, budget: float, rng: np.random.Generator
 
 
 def in_layers(job: Job, starts: Places, hint: Places, width: int) -> tuple[list[tuple[float, Places]], Effort]:
-    """Best-first in layers from `starts` [n, 2]: the best paths of each layer, with how far they leave the sand (m).
+    """Searches best-first in layers: the paths of layer k have k legs.
 
-    A node is the map with the tool down, and its place. It is ranked by its map with the tool lifted; of the children of a
-    layer the `width` best are kept whose lifted maps or places differ. See `strokes.in_layers` for why order by distance is
-    A*'s order.
+    A node is the map with the tool down and the tool's place, and it is ranked by its map with the tool lifted. Of the
+    children of a layer the `width` best are kept whose lifted maps or places differ. For why order by distance is A*'s order
+    see `strokes.in_layers`.
+
+    Args:
+      job: what to search for.
+      starts: rows and columns [n, 2] of the corners to begin at.
+      hint: a path whose beginning is kept in every layer.
+      width: nodes of a layer.
+
+    Returns:
+      The best paths of each layer, with how far from the goal they leave the sand (m); and what the search cost.
     """
     at = corners(job.scene, job.actions)
     grain = _GRAIN * np.abs(job.height - job.goal).max()
@@ -66,14 +79,16 @@ def in_layers(job: Job, starts: Places, hint: Places, width: int) -> tuple[list[
 
 
 def follow_padded(scene: Scene, height: np.ndarray, path: Path, legs: int) -> np.ndarray:
-    """What `follow` makes of a path of up to `legs` legs, by one program for all; NaN where the outcome is not clean."""
+    """The map [H, W] that `follow` makes of a path of up to `legs` legs, all by one program; NaN where the outcome is not
+    clean.
+    """
     path = np.concatenate([path, np.repeat(path[-1:], legs + 1 - len(path), axis=0)])
     shaped = jax.block_until_ready(follow(scene, np.asarray(height, np.float32), path.astype(np.float32)))
     return np.asarray(shaped.height) if int(shaped.outcome) == Outcome(0) else np.full(height.shape, np.nan)
 
 
 def _starts(job: Job, at: np.ndarray, count: int) -> Places:
-    """The corners with the most sand to take away around them, where there is any."""
+    """The `count` corners with the most surplus sand around them, or the first corner if there is none."""
     half = job.actions.cell // 2
     rows, columns = np.floor(at[..., ::-1] / float(job.scene.grid.spacing)).astype(int).reshape(-1, 2).T
     surplus = np.pad(np.maximum(job.height - job.goal, 0).astype(float), half)

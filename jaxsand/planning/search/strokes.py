@@ -1,8 +1,7 @@
-"""The search over strokes with the tool lifted in between: layers of real maps, then better strokes one by one."""
+"""The search over strokes with the tool lifted in between: layers of maps, then better strokes one by one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -10,6 +9,7 @@ from jaxsand.planning.search.actions import Job, Path, confined, moved, propose
 from jaxsand.planning.search.rollouts import CHEAP, Effort, distance, distinct, marks, pushed, roughly_pushed
 from jaxsand.scene.scene import Scene
 
+_Push = Callable[[Scene, np.ndarray, np.ndarray], np.ndarray]  # what strokes [n, 4] make of maps [n, H, W]
 _LAYERS = 0.25  # of the budget goes to the layers, half of it to rough pushes
 _GRAIN = 1 / 20  # of the largest height to change: what maps are told apart by
 _TRIED = 8  # variants of a plan, the best by rough pushes, are pushed in full
@@ -20,7 +20,13 @@ _PLANS = 12  # strokes in all plans that are improved at first; one plan at last
 
 @dataclass(frozen=True)
 class Nodes:
-    """`maps` [n, H, W] that plans [n, k, 4] lead to, closest to the goal first, and their `distance` [n] (m)."""
+    """The nodes of a layer, closest to the goal first.
+
+    Attributes:
+      maps: [n, H, W] (m), what the plans leave.
+      plans: [n, k, 4] (m).
+      distance: [n] (m), of the maps from the goal.
+    """
 
     maps: np.ndarray
     plans: np.ndarray
@@ -28,18 +34,21 @@ class Nodes:
 
 
 def search_strokes(job: Job, hints: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
-    """The best strokes found for a job, at a cost of about `budget` full pushes. `hints` [m, 4] are tried in every layer."""
+    """The best strokes found for a job, at a cost of about `budget` full pushes; the strokes `hints` [m, 4] are tried
+    everywhere.
+    """
     nodes, effort = in_layers(job, hints, _LAYERS * budget, _WIDTH, rng)
     plan, more = improved(job, nodes.plans[: max(1, _PLANS // job.strokes)], budget - effort.cost, rng)
     return [stroke.reshape(2, 2) for stroke in plan], effort + more
 
 
 def in_layers(job: Job, hints: np.ndarray, budget: float, width: int, rng: np.random.Generator) -> tuple[Nodes, Effort]:
-    """Best-first in layers: the nodes of a layer have taken equally many strokes.
+    """Searches best-first in layers: the nodes of layer k have taken k strokes.
 
-    In A*'s f = g + h, with h the distance to the goal over the most that one stroke can change, g is the same for a whole
-    layer and the divisor for all, so that order by f is order by distance. All children of a layer are pushed roughly, the
-    best of them in full, and of these the `width` best that differ are kept.
+    All children of a layer are pushed roughly, the best of them in full, and of these the `width` best that differ are kept.
+
+    They are ordered by distance from the goal, which is A*'s order: in f = g + h, with h the distance over the most that one
+    stroke can change, g is the same for a whole layer and the divisor for all nodes.
     """
     grain = _GRAIN * np.abs(job.height - job.goal).max()
     nodes = Nodes(job.height[None], np.zeros((1, 0, 4)), distance(job.height[None], job.goal))
@@ -62,11 +71,14 @@ def in_layers(job: Job, hints: np.ndarray, budget: float, width: int, rng: np.ra
 
 
 def improved(job: Job, plans: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[np.ndarray, Effort]:
-    """The best of some plans [m, n, 4], after their strokes were varied one at a time.
+    """Varies the strokes of plans [m, n, 4] one at a time, and returns the best plan.
 
-    Variants of a stroke are ranked by pushing them, and what follows, roughly: what a variant is expected to leave is the
-    map that the plan leaves, plus the difference that the rough push makes between the two. The best are pushed in full.
-    Plans that lag behind are given up on the way. At last strokes at the end that do not help are left out.
+    Variants of a stroke are ranked roughly: the map expected of a variant is the map that the plan leaves, plus the
+    difference that rough pushes make between the two. The best variants are pushed in full. Plans that lag behind are given
+    up on the way. Strokes at the end that do not help are left out at last.
+
+    Returns:
+      The plan [k, 4] (m), and what the search cost.
     """
     count = plans.shape[1]
     ways = [finish(job.scene, plan[None], 0, job.height[None])[:, 0] for plan in plans]
@@ -94,8 +106,12 @@ def improved(job: Job, plans: np.ndarray, budget: float, rng: np.random.Generato
     return plans[best][: int(distance(ways[best], job.goal).argmin())], effort
 
 
-def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push: Callable[..., Any] = pushed) -> np.ndarray:
-    """The maps on the way of plans [m, n, 4] from stroke `first` on, [n - first + 1, m, H, W], from `start` [1, H, W]."""
+def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push: _Push = pushed) -> np.ndarray:
+    """Pushes the strokes of plans [m, n, 4] from stroke `first` on.
+
+    Returns:
+      The maps [n - first + 1, m, H, W] before each of these strokes and at the end; all begin from `start` [1, H, W].
+    """
     maps = [np.repeat(start, len(plans), axis=0)]
     for k in range(first, plans.shape[1]):
         maps.append(push(scene, maps[-1], plans[:, k]))
@@ -103,8 +119,7 @@ def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push:
 
 
 def _near(job: Job, plan: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
-    """Plans [31, n, 4] that differ from `plan` [n, 4] in that stroke k is moved a little; in one it is reversed, and in one
-    it trades places with the next."""
+    """Plans [31, n, 4] that differ from `plan` [n, 4] in stroke k: it is moved, reversed, or swapped with the next."""
     some = np.repeat(plan[None], 31, axis=0)
     some[:, k] = moved(job.scene, job.actions, some[:, k], rng)
     some[0, k] = plan[k][[2, 3, 0, 1]]
@@ -114,8 +129,11 @@ def _near(job: Job, plan: np.ndarray, k: int, rng: np.random.Generator) -> np.nd
 
 
 def _far(job: Job, plan: np.ndarray, k: int, way: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Plans [255, n, 4] in which stroke k is a new one, or left out and a new one added at the end, or joined with the next
-    so that there is room for a new one. New ones are proposed by the maps on the `way` of the plan, before k and at its end.
+    """Plans [255, n, 4] in which stroke k of `plan` [n, 4] is replaced.
+
+    A new stroke takes its place; or k is left out and a new one added at the end; or k is joined with the next, and a new
+    one takes the place that is free. New strokes are proposed from the maps `way` on the plan's way, before k and at its
+    end.
     """
     some = np.repeat(plan[None], 255, axis=0)
     early, late = (propose(job.scene, job.actions, m, job.goal, 128, rng) for m in (way[k], way[-1]))

@@ -1,4 +1,4 @@
-"""Tasks on real sand in which the binary model of dug and not dug is wrong: berms count, order counts, or nothing is dug."""
+"""Tasks on real sand for which the binary model fails: berms count, order counts, or nothing is dug."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,16 @@ _SHAPE, _SPACING = (32, 32), 0.01
 
 @dataclass(frozen=True)
 class SandTask:
-    """A map [H, W] (m) at rest, the goal [H, W] (m), compared whole, and how many strokes or legs of which kind."""
+    """A planning task.
+
+    Attributes:
+      name: for tables.
+      scene: grid, sand and blade.
+      height: the map [H, W] (m) to start from, at rest.
+      goal: [H, W] (m), compared with berms.
+      strokes: how many strokes or legs are allowed.
+      actions: their kind.
+    """
 
     name: str
     scene: Scene
@@ -62,7 +71,7 @@ def _frame() -> SandTask:
 
 
 def _ridge() -> SandTask:
-    """A trench at the foot of a ridge that is to stay, its sand on the far side alone; no strokes reach that."""
+    """A trench at the foot of a ridge that is to stay, with its sand on the far side only; no strokes reach that goal."""
     scene = _scene(Blade())
     x, y = _places()
     ridge = _at_rest(scene, 0.02 * ((np.abs(y - 0.19) < 0.015) & (np.abs(x - 0.16) < 0.11)))
@@ -72,19 +81,19 @@ def _ridge() -> SandTask:
 
 
 def _pit() -> SandTask:
-    """A heap beside a pit of its size: level, with a blade that scrapes at height 0."""
+    """A heap beside a pit of the same size, to be levelled with a blade that scrapes at height 0."""
     x, y = _places()
     pit = 0.03 * (np.hypot(x - 0.1, y - 0.16) < 0.04) - 0.03 * (np.hypot(x - 0.21, y - 0.16) < 0.04)
     return _levelling("pit from a heap", pit, 8)
 
 
 def _rough() -> SandTask:
-    """A rough surface: level."""
+    """A rough surface to be levelled."""
     return _levelling("rough surface", rough_surface(np.random.default_rng(5), _SHAPE, 0.022, 1.6), 12)
 
 
 def _terrain() -> SandTask:
-    """A patch of real terrain, of 3 cm relief: level."""
+    """A patch of real terrain, of 3 cm relief, to be levelled."""
     land = task.resample(surfaces.terrain()[100:200, 100:200], _SHAPE)
     return _levelling("terrain", 0.03 * (land - np.median(land)) / (land.max() - land.min()), 12)
 
@@ -115,13 +124,14 @@ SAND_TASKS: dict[str, Callable[[], SandTask]] = {
 
 
 def _drawn(name: str, strokes: list[list[float]]) -> SandTask:
-    """The goal is what some strokes leave on level sand, berms and all."""
+    """A task whose goal is what the given strokes leave on level sand, with berms."""
     scene, level = _scene(Blade()), np.zeros(_SHAPE, np.float32)
     goal = replay(scene, level, [np.array(stroke).reshape(2, 2) for stroke in strokes])
     return SandTask(name, scene, level, goal, len(strokes), Lattice())
 
 
 def _levelling(name: str, height: np.ndarray, strokes: int) -> SandTask:
+    """A task to level a surface, with a blade 4 cm wide that scrapes at height 0."""
     scene = _scene(Blade(width=0.04, thickness=0.015, depth=0.0))
     height = _at_rest(scene, height)
     return SandTask(name, scene, height - height.mean(), np.zeros(_SHAPE), strokes, Lattice())
