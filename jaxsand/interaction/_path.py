@@ -1,4 +1,4 @@
-"""A tool's way along a path of legs, whatever it does to the sand on each."""
+"""Moves a tool along a path of straight legs, with any rule for what it does to the sand on each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float, Int
 
 from jaxsand.interaction._displacement import Job
 from jaxsand.relaxation.flux import worst_excess
@@ -35,12 +36,26 @@ from jaxsand.scene.window import Window
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Pushed:
-    """A map [H, W] (m) after the tool was lifted and before it settles, the `outcome` (bits of `Outcome`), the volume that
-    `drained` over the map's edge (m^3), and the tool's last `pose`."""
+    """A map after the tool was lifted and before it settles. Of a batch, every field has the batch axis in front.
 
-    height: jax.Array
-    outcome: jax.Array
-    drained: jax.Array
+    Attributes:
+        height: height map [H, W] (m).
+        outcome: bits of `Outcome`; 0 when all went well. See `check`.
+        drained: volume that ran off over a draining edge during the push (m^3).
+        pose: where the tool was lifted, and its heading.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> pushed = js.act(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]))
+        >>> int(pushed.outcome), float(pushed.drained)
+        (0, 0.0)
+    """
+
+    height: Float[Array, "*batch H W"]
+    outcome: Int[Array, "*batch"]
+    drained: Float[Array, "*batch"]
     pose: Pose
 
 
@@ -58,9 +73,10 @@ def along_legs(
 ) -> tuple[Pushed, Any]:
     """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it.
 
-    `leg(job, pose, length, before, state)` moves it from `pose` by `length`; `before` is the pose that the tool has there
-    already, None when it is yet to be lowered. Also returns what `record(height)` gave after each leg, stacked. Without a
-    tool the map stays as it is.
+    `leg(job, pose, length, before, state)` moves the tool from `pose` by `length` (m). `before` is the tool's pose at the
+    end of the last leg, or None if the tool is yet to be lowered. Without a tool the map stays as it is.
+
+    Returns the map after the path, and what `record(height)` returned after each leg, stacked.
     """
     # Beyond this the floats cannot tell on which side of the map a point lies.
     farthest = scene.grid.spacing * 2.0 ** (jnp.finfo(path.dtype).nmant + 8)
@@ -112,7 +128,7 @@ def along_legs(
 
 
 def over_the_map(scene: Scene, job: Job, pose: Pose, length: jax.Array) -> tuple[Pose, jax.Array]:
-    """The part of a leg on which the blade touches the map: the pose where it starts, and its length."""
+    """The part of a leg on which the tool can touch the map: the pose where that part starts, and its length (m)."""
     dx = job.bed.spacing
     along = corners(scene, job, pose)
     far = reach(job.tool) + dx
@@ -130,7 +146,7 @@ def turn_between(before: Pose, after: Pose) -> jax.Array:
 
 
 def corners(scene: Scene, job: Job, pose: Pose) -> tuple[jax.Array, jax.Array]:
-    """How far along a heading the map begins and ends (m)."""
+    """The least and the largest distance of the map's corners along a heading, from the pose (m)."""
     rows, columns = scene.grid.shape
     dx = job.bed.spacing
     along = [local(pose, x * dx, y * dx)[0] for x in (0, columns) for y in (0, rows)]
@@ -143,7 +159,7 @@ def _outcome(window_edge: jax.Array, not_finite: jax.Array) -> jax.Array:
 
 
 def _heading(start: jax.Array, stop: jax.Array, before: Pose | None) -> tuple[Pose, jax.Array]:
-    """The pose at the start of a leg and the leg's length. A leg of no length keeps the heading; the first one faces +x."""
+    """The pose at the start of a leg, and the leg's length (m). A leg of no length keeps the heading; the first faces +x."""
     run = stop - start
     size = lax.stop_gradient(jnp.max(jnp.abs(run)))  # squares of far strokes would overflow
     moving = size > 0

@@ -1,9 +1,9 @@
-"""Many pushes at once: on every core, strokes of like length together, each in a window around its blade.
+"""Many pushes at once, on every core.
 
-A vmapped push takes as long as the longest of its strokes, and the sand moves in a part of the map alone. So a batch is
-sorted by length and cut into groups, of which each core takes the next; only a window around the blade is computed, and
-what reaches the window's edge is pushed again in a wider one, in the end on the whole map. A map comes out as it would
-alone, up to rounding.
+A vmapped push takes as long as the longest of its strokes, and sand moves only near the tool. So a batch is sorted by the
+length of its strokes and cut into groups, which the cores take one after the other. Only a window around the blade is
+computed. A push whose sand reaches the window's edge is computed again in a wider window, in the end on the whole map. Each
+map comes out as it would alone, up to rounding.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.blade_stepped import windows_for
@@ -24,61 +26,111 @@ from jaxsand.relaxation.stopping import Outcome, Stop, as_batch, check_chunk
 from jaxsand.scene.scene import Scene, as_array
 from jaxsand.scene.window import Whole
 
-Array = jax.typing.ArrayLike
-Loss = Callable[..., jax.Array]
-_GRADIENTS = 32  # the most that are pulled back together, on a CPU
+Loss = Callable[..., Float[Array, ""]]
+_GRADIENTS = 32  # the most maps that are differentiated together, on a CPU
 
 
 def step_batch(
     scene: Scene,
-    height: Array,
-    stroke: Array,
+    height: Float[ArrayLike, "B H W"],
+    stroke: Float[ArrayLike, "B 4"],
     *,
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     chunk: int | None = None,
 ) -> Shaped:
-    """`step` on a batch of maps [B, H, W] and strokes [B, 4] of one scene; every field of the result gains the batch axis.
+    """`step` for a batch of maps and strokes of one scene, on every core.
 
-    Faster than `jax.vmap(step)`, and for the same reason an outermost program: call it as it is, not inside `jit`, `grad` or
-    `vmap`. `chunk` is how many maps are pushed together; the default suits the machine.
+    It is faster than `jax.vmap` of `step`: strokes of like length are computed together, each in a window around its tool.
+    Call it from plain Python only, not inside `jit`, `grad` or `vmap`, where `jax.vmap` of `step` does the same.
+
+    Args:
+        scene: the scene of all maps, with the tool.
+        height: height maps [B, H, W] (m).
+        stroke: one stroke [4] = x0, y0, x1, y1 (m) for each map, [B, 4].
+        push: as of `step`.
+        scheme: as of `settle`.
+        stop: as of `settle`.
+        chunk: number of maps that are pushed together, 1 or more; None for what suits the machine.
+
+    Returns:
+        The results; every field has the batch axis in front, `height` [B, H, W].
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range, the push does not go with the tool, or it is called
+            inside `jit`, `grad` or `vmap`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> strokes = jnp.array([[0.02, 0.04, 0.06, 0.04], [0.04, 0.02, 0.04, 0.06]])
+        >>> js.step_batch(scene, jnp.zeros((2, 8, 8)), strokes).height.shape
+        (2, 8, 8)
     """
     return _batch(_step_program(), scene, height, stroke, (push, scheme, stop), chunk)
 
 
-def act_batch(scene: Scene, height: Array, stroke: Array, *, push: Push | None = None, chunk: int | None = None) -> Pushed:
-    """`act` on a batch of maps [B, H, W] and strokes [B, 4] of one scene, like `step_batch`."""
+def act_batch(
+    scene: Scene,
+    height: Float[ArrayLike, "B H W"],
+    stroke: Float[ArrayLike, "B 4"],
+    *,
+    push: Push | None = None,
+    chunk: int | None = None,
+) -> Pushed:
+    """`act` for a batch of maps [B, H, W] (m) and strokes [B, 4] (m) of one scene, called like `step_batch`."""
     return _batch(_act_program(), scene, height, stroke, (push, None, None), chunk)
 
 
 def value_and_grad_batch(
     scene: Scene,
     loss: Loss,
-    height: Array,
-    stroke: Array,
+    height: Float[ArrayLike, "B H W"],
+    stroke: Float[ArrayLike, "B 4"],
     *args: Any,
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     chunk: int | None = None,
-) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    """Losses of what strokes leave, and their gradients: an outermost program like `step_batch`.
+) -> tuple[Float[Array, " B"], tuple[Float[Array, "B H W"], Float[Array, "B 4"]]]:
+    """A loss of what each stroke of a batch leaves, and its gradient with respect to map and stroke, on every core.
+
+    For each map it computes loss(step(scene, height, stroke).height, *args) and differentiates that. Call it from plain
+    Python only, not inside `jit`, `grad` or `vmap`, where `jax.value_and_grad` and `jax.vmap` do the same.
 
     Args:
-      loss: from a map [H, W] (m) after the push, and what of `args` belongs to it, to a number. Pass the same function every
-        time: a new one is compiled anew, which takes a quarter of a minute.
-      height, stroke: maps [B, H, W] (m) before, and strokes [B, 4] (m).
-      args: arrays, or trees of them, with a leading axis of length B.
+        scene: the scene of all maps, with the tool.
+        loss: a function of a settled map [H, W] (m) and of its part of `args` that returns a scalar. Pass the same function
+            in every call: each new one is compiled anew, which takes a quarter of a minute.
+        height: height maps [B, H, W] (m) before the pushes.
+        stroke: one stroke [4] = x0, y0, x1, y1 (m) for each map, [B, 4].
+        *args: arrays, or pytrees of arrays, with a leading axis of length B: such as one goal for each map.
+        push: as of `step`.
+        scheme: as of `settle`.
+        stop: as of `settle`.
+        chunk: number of maps that are computed together, 1 or more; None for what suits the machine.
 
     Returns:
-      The losses [B], and the gradients by the maps [B, H, W] and by the strokes [B, 4]. NaN where the outcome is not finite,
-      or where sand reached the edge of the scene's own window.
+        The losses [B], and a pair of gradients: by the maps [B, H, W], and by the strokes [B, 4]. They are NaN where the
+        outcome is NOT_FINITE, or where sand reached the edge of a `Window` that the scene was given.
+
+    Raises:
+        ValueError: as of `step_batch`.
 
     Example:
-      >>> def miss(height, goal):
-      ...     return jnp.sum((height - goal) ** 2)
-      >>> values, (by_height, by_stroke) = js.value_and_grad_batch(scene, miss, heights, strokes, goals)
+        The distance to a goal; here of a scene without a tool, which compiles faster.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> def miss(height, goal):
+        ...     return jnp.sum((height - goal) ** 2)
+        >>> scene = js.make_scene((8, 8), 0.01)
+        >>> heights, goals, strokes = jnp.zeros((2, 8, 8)), jnp.ones((2, 8, 8)), jnp.zeros((2, 4))
+        >>> losses, (by_height, by_stroke) = js.value_and_grad_batch(scene, miss, heights, strokes, goals)
+        >>> losses.tolist(), by_height[0, 0, 0].tolist(), by_stroke.shape
+        ([64.0, 64.0], -2.0, (2, 4))
     """
     program = _gradient_program(loss)
     chunk = _GRADIENTS if chunk is None and jax.default_backend() == "cpu" else chunk
@@ -119,7 +171,7 @@ def _lengths(batch: Any) -> np.ndarray:
 
 
 def _flagged(out: Any) -> jax.Array:
-    """Where sand reached a window's edge."""
+    """Which results of a batch say that sand reached the edge of the window."""
     return (out[-1] if isinstance(out, tuple) else out.outcome) & Outcome.WINDOW_EDGE
 
 

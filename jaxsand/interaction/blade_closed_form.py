@@ -1,4 +1,4 @@
-"""A push in one go: what the blade's swath takes up is set down as berms, as a heap ahead, and behind the start.
+"""A blade's whole leg in closed form: its swath is taken up and set down as berms, as a heap ahead, and behind the start.
 
 The blade pushes a heap of height H before it (_mound.py). What sticks out of the heap's two flanks is left behind as berms,
 triangles at repose of cross section H^2 / (2 mu) each, mu = tan(angle of repose). A blade of width w that cuts d deep is in
@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxsand.interaction._displacement import Job, contact, settle_around, take, whole
 from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
@@ -59,10 +60,14 @@ ROOM = 0.25  # with less room than this part of a profile's own, sand is held ba
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SwathPush:
-    """Trench, berms and heap of a whole leg at once, in closed form; a fast approximation of `SteppedPush`.
+    """A blade's whole leg at once, in closed form: trench, berms and heap. A fast approximation of `SteppedPush`.
 
-    Exact in a channel that the blade fills, and over what edge it ends. In the open the settled map lies from the full push
-    (`SteppedPush.fine()`, in sum |h - h_ref| / sum |h_ref|; 8 strokes each, blades of 6 by 3 cells):
+    The sand of the trench is set down as two berms at repose and a heap ahead of the blade, whose volume V follows from
+    dV/ds = q - a V / l along the stroke, with q the sand taken up per length, a the open share of the flanks and l a length
+    of the order of the blade's width; blade_closed_form.py derives it.
+
+    It is exact in a channel that the blade fills. In the open, the settled map differs from that of `SteppedPush.fine()` by
+    (sum |h - h_ref| / sum |h_ref|, 8 strokes each, blades of 6 by 3 cells):
 
     | depth / width | 1/15 | 1/4 | 1/3 | 1/2 | 1 |
     |---|---|---|---|---|---|
@@ -70,19 +75,30 @@ class SwathPush:
     | as long as the blade is thick | | 19% | | 28% | |
     | of no length | | 23% | | 22% | |
 
-    and 42% for a blade 1.5 cells thick; 27% for the default blade on cells of 1 cm. After each leg but the last
-    the sand around the blade gets `sweeps` sweeps at `rate`. It works on the whole map, whatever the scene's window. The
-    memory of its derivative grows with the cells times a quarter of those along the map's diagonal.
+    and by 42% for a blade 1.5 cells thick; 27% for the default blade on cells of 1 cm. It computes the whole map, whatever
+    the scene's window. Reverse mode needs memory in proportion to the cells of the map times those along its diagonal.
+
+    Attributes:
+        sweeps: number of sweeps of the sand around the blade after each leg but the last; static.
+        rate: rate of these, as of `Relaxation`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> shaped = js.step(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]), push=js.SwathPush())
+        >>> bool(shaped.height[4, 4] < 0)
+        True
     """
 
     sweeps: int = field(default=8, metadata={"static": True})
-    rate: jax.Array | float = 0.125
+    rate: Float[Array, ""] | float = 0.125
 
 
 def push_swath(
     scene: Scene, height: jax.Array, path: jax.Array, push: SwathPush, record: Callable[[jax.Array], Any] | None = None
 ) -> tuple[Pushed, Any]:
-    """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
+    """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
     scene = replace(scene, window=Whole())
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
@@ -206,7 +222,7 @@ def _sweep_out(  # noqa: PLR0915
 def _ring(
     pose: Pose, job: Job, under: jax.Array, sand: jax.Array, first: jax.Array, back: jax.Array, mu: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """What leaves to behind and beside a blade that is lowered, and its share of what lay there, at most `back`."""
+    """The sand [H, W] that leaves behind and beside a blade as it is lowered, and its share of all that lay there."""
     dx, tool = job.bed.spacing, job.tool
     half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2
     s, n = local(pose, job.x, job.y)
@@ -233,7 +249,7 @@ def _heap(
     mu: jax.Array,
     rim: Rim | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The heap ahead of the blade, what finds no room there, and what runs off over the rim."""
+    """The heap ahead of the blade [H, W], the part of `volume` that finds no room there, and the part that runs off."""
     dx, side = job.bed.spacing, jnp.asarray(job.tool.width) / 2
     s, n = local(pose, job.x, job.y)
     where = lean(s - end - _AHEAD * dx * jnp.maximum(open_[0], open_[1]), jnp.abs(n) - side, dx, sand)
@@ -259,7 +275,7 @@ def _heap(
 
 
 def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
-    """The largest stable step, its mean by weight where it differs from cell to cell."""
+    """The largest stable step between neighbours (m): the bed's, or its weighted mean where it differs from cell to cell."""
     drop = job.bed.drop
     if not drop.ndim:
         return drop
@@ -268,7 +284,7 @@ def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
 
 
 def complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:
-    """What is put down, and on its highest cell what the cuts left over; adds up to what was taken, exactly."""
+    """`put` with the rounding error of its sum added to its highest cell, so that it adds up to `taken` exactly."""
     # The counts fit their integers or wrap around; their sum is right, since what is left over is small.
     quanta = jnp.round(lax.stop_gradient(taken - put) / job.flow.quantum)
     rest = jnp.sum(quanta.astype(jnp.int64 if put.dtype == jnp.float64 else jnp.int32)).astype(put.dtype)
@@ -281,7 +297,10 @@ def complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:
 
 
 def _heap_balance(gains: jax.Array, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The heap's volume at the end and what it leaves in each slice, of which it takes up `gains` and leaves `shares`."""
+    """The heap's volume after all slices, and what it leaves in each.
+
+    In each slice the heap gains `gains`, and leaves the part `shares` of its volume.
+    """
 
     def pass_by(volume: jax.Array, slice_: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         gain, share = slice_

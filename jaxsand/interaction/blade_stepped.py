@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import repeat, repeat_until
 from jaxsand.interaction._advance import Advance, Rest
@@ -37,20 +38,35 @@ from jaxsand.scene.window import AsNeeded, Window
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SteppedPush:
-    """The blade advances by `substep` spacings at a time; after each the sand around it gets `sweeps` sweeps.
+    """The tool advances by small sub-steps, and the sand around it is brought to rest after each: the default push.
 
-    The last, shorter sub-step of a leg counts in proportion to its length, so that the result is continuous in the stroke.
-    As `substep` goes to 0 (and 1 / sweeps with it) the map converges to the quasi-static limit; `jaxsand bench push` tells
-    how closely, and at what cost. `rate` is the share of an excess that a sweep moves over a straight link.
+    It approximates the quasi-static limit, in which the tool moves so slowly that the sand around it is always at rest, for
+    a `Blade` or a `Wheel`. In each sub-step the sand in the newly covered part of cells moves one cell on along the
+    normal of the tool's face; then `sweeps` proximal gradient steps bring the sand around the tool to repose. The map
+    converges to the limit as `substep` and 1 / `sweeps` go to 0; `jaxsand bench push` measures the error and the cost. The
+    last, shorter sub-step of a leg counts in proportion to its length, so that the result is continuous in the stroke.
+
+    Attributes:
+        substep: length of a sub-step in spacings, above 0 and at most 1; static.
+        sweeps: number of proximal steps after each sub-step; static.
+        rate: step length of these, as the rate of `Relaxation`.
+
+    Source:
+        Kim, Pavlov & Johnson, arXiv:1908.02745, section "Tool Interaction", with shares of cells in place of whole cells.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.SteppedPush.fine()
+        SteppedPush(substep=0.0625, sweeps=8, rate=0.2)
     """
 
     substep: float = field(default=0.125, metadata={"static": True})
     sweeps: int = field(default=4, metadata={"static": True})
-    rate: jax.Array | float = 0.2
+    rate: Float[Array, ""] | float = 0.2
 
     @classmethod
     def fine(cls) -> "SteppedPush":
-        """Closer to the limit, at about three times the cost."""
+        """A push with half the sub-step and twice the sweeps: closer to the limit, at about three times the cost."""
         return cls(1 / 16, 8)
 
 
@@ -62,9 +78,9 @@ def push_along(
     record: Callable[[jax.Array], Any] | None = None,
     rest: Rest = bring_to_rest,
 ) -> tuple[Pushed, Any]:
-    """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`.
+    """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`.
 
-    `rest` brings the sand to rest after each sub-step (`bring_to_rest` of resting.py).
+    `rest` is the function that brings the sand to rest after each sub-step.
     """
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
@@ -135,7 +151,7 @@ def _leg(
 
 
 def with_near(scene: Scene) -> Scene:
-    """The scene, whose window says how much of it is near its blade, if the blade's size is known."""
+    """The scene with its window's `near` set, if it has a window and the blade's size is known."""
     if not (isinstance(scene.window, Window) and isinstance(scene.tool, Blade)):
         return scene
     known = _known(scene.tool.width, scene.tool.thickness, scene.grid.spacing)
@@ -149,7 +165,7 @@ def with_near(scene: Scene) -> Scene:
 
 
 def _known(*leaves: Any) -> list[float] | None:
-    """Numbers of one scene, unless one of them is traced or belongs to many scenes."""
+    """The values as numbers, or None if one of them is traced or an array for many scenes."""
     found = [concrete(x) for x in leaves]
     if any(x is None or x.ndim for x in found):
         return None
@@ -157,8 +173,10 @@ def _known(*leaves: Any) -> list[float] | None:
 
 
 def _far(width: Any, thickness: Any) -> Any:
-    """How far from a block's middle, in cells, a blade can cover one: covers are smoothed over a spacing, and a block stays
-    where it is while the blade moves by one."""
+    """The largest distance, in cells, from a block's middle to a cell that the blade covers.
+
+    It allows for a footprint smoothed over a spacing, and for a block that stays put while the blade moves by a spacing.
+    """
     return ((width + 1) ** 2 + (thickness + 1) ** 2) ** 0.5 / 2 + 1
 
 
@@ -167,8 +185,10 @@ _LEAST = 1.5  # times a window's width: the map's, for the window to save work
 
 
 def windows_for(scene: Scene, push: Any, times: float = 1) -> Iterator[Scene]:
-    """The scene with windows around its blade, the first so many times as wide as a stroke asks for and each twice as wide
-    as the one before, as long as that saves work; sand that reaches a window's edge asks for the next."""
+    """The scene with windows around its blade, each twice as wide as the one before, as long as that saves work.
+
+    The first is `times` as wide as the blade and the heap that it pushes. The next is for sand that reaches its edge.
+    """
     if not (isinstance(scene.window, AsNeeded) and isinstance(scene.tool, Blade) and isinstance(push, SteppedPush)):
         return
     known = _known(scene.tool.width, scene.tool.thickness, scene.tool.depth, scene.grid.spacing)

@@ -1,4 +1,4 @@
-"""The simulator: a tool acts, the sand settles."""
+"""The simulator: a tool moves through the sand, then the sand settles."""
 
 import math
 from collections.abc import Callable
@@ -8,6 +8,8 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.blade_closed_form import SwathPush, push_swath
@@ -40,15 +42,55 @@ _SURE = 1.5  # times the width of a window that a stroke asks for, where there i
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shaped(Settled):
-    """A settled map (see `Settled`) and the `pose` in which the tool was lifted."""
+    """A map after a push and settling: the fields of `Settled`, and the tool's last pose.
+
+    Of a batch or a rollout, every field has an axis more in front.
+
+    Attributes:
+        height: height map [H, W] (m).
+        sweeps: number of sweeps of settling.
+        residual: largest slope in excess of repose that is left, a tangent. It carries no derivative.
+        outcome: bits of `Outcome`, of the push and of settling; 0 when all went well. See `check`.
+        drained: volume that ran off over a draining edge, during the push and settling (m^3).
+        pose: where the tool was lifted, and its heading.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> shaped = js.step(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]))
+        >>> int(shaped.outcome), shaped.height.shape
+        (0, (8, 8))
+    """
 
     pose: Pose
 
 
-def act(scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike, *, push: Push | None = None) -> Pushed:
-    """What the tool does to a map [H, W] (m) along `stroke` [4] = x0, y0, x1, y1 (m), up to when it has been lifted.
+def act(scene: Scene, height: Float[ArrayLike, "H W"], stroke: Float[ArrayLike, "4"], *, push: Push | None = None) -> Pushed:
+    """One straight push without settling: the map just after the tool was lifted.
 
-    The map is not settled afterwards; see `step`.
+    Sand that was not at rest when the tool was lifted stays as it is; `step` lets it settle too. Differentiable like `step`.
+
+    Args:
+        scene: the scene, with the tool.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        stroke: start and end of the tool's centre [4] = x0, y0, x1, y1 (m).
+        push: `SteppedPush` (the default), `SwathPush` for a blade, or `SplitPush` for a wheel.
+
+    Returns:
+        The map, the outcome, the volume that drained, and the tool's last pose.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range, or the push does not go with the tool.
+        NotImplementedError: a second derivative is asked for.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade(depth=0.0075))
+        >>> pushed = js.act(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]))
+        >>> bool(pushed.height[4, 4] < 0), bool(pushed.height[4, 7] > 0)  # a trench, and a heap ahead of it
+        (True, True)
     """
     scene, height, rules = ready(scene, height, push, None, None)
     path = _stroke(stroke, height.dtype)
@@ -57,25 +99,53 @@ def act(scene: Scene, height: jax.typing.ArrayLike, stroke: jax.typing.ArrayLike
 
 def step(
     scene: Scene,
-    height: jax.typing.ArrayLike,
-    stroke: jax.typing.ArrayLike,
+    height: Float[ArrayLike, "H W"],
+    stroke: Float[ArrayLike, "4"],
     *,
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
-    """One straight push on a map [H, W] (m), then settling. One map; batch with `jax.vmap` or `step_batch`.
+    """One straight push, then settling.
 
-    `stroke` [4] is x0, y0, x1, y1 (m). The tool is lowered at the start, moved to the end and lifted. Parts of a stroke that
-    lie off the map touch nothing; a stroke of no length lowers and lifts the tool, facing +x. A stroke that is not finite
-    leaves the map as it is and says so in the outcome.
+    The tool is lowered at the start of the stroke, moved to its end, and lifted. Then the sand settles. Parts of a stroke
+    off the map touch nothing. A stroke of no length lowers and lifts the tool, facing +x. A stroke that is not finite leaves
+    the map as it is, and the outcome says NOT_FINITE. At a wall or a closed edge the sand ahead of a blade has nowhere to
+    go: it stays in its cells, inside the blade, and flows off when the blade is lifted.
 
-    At a wall or a closed edge the sand ahead has nowhere to go: it stays in its columns, inside the blade, and flows off
-    when the blade is lifted. Everywhere else no sand is inside the tool.
+    Differentiable once, in forward and reverse mode, in the height, the stroke, the angle of repose and the tool. The
+    derivative is exactly zero where the push changes nothing (a stroke off the map, a tool above the sand). The result is
+    continuous in the stroke, except where its length goes to zero and the heading is lost.
 
-    Differentiable once, in forward and reverse mode, in the height, the stroke, the angle of repose and the tool; exactly
-    zero where nothing changes (a stroke off the map, a tool above the sand). Continuous in the stroke, except where its
-    length goes to zero and its heading is lost.
+    Args:
+        scene: the scene, with the tool.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx. Use `jax.vmap` or
+            `step_batch` for many.
+        stroke: start and end of the tool's centre [4] = x0, y0, x1, y1 (m).
+        push: how the tool moves the sand: `SteppedPush` (the default), `SwathPush` for a blade, or `SplitPush` for a wheel.
+        scheme: scheme of settling, as of `settle`.
+        stop: stop rule of settling, as of `settle`.
+
+    Returns:
+        The settled map, the outcome of push and settling, the volume that drained, and the tool's last pose.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range, or the push does not go with the tool.
+        NotImplementedError: a second derivative is asked for.
+
+    Source:
+        Kim, Pavlov & Johnson, arXiv:1908.02745, section "Tool Interaction".
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> level = jnp.zeros((8, 8))
+        >>> shaped = js.step(scene, level, jnp.array([0.02, 0.04, 0.06, 0.04]))
+        >>> bool(shaped.height[4, 4] < 0), bool(shaped.height[4, 7] > 0)  # a trench, and a heap ahead of it
+        (True, True)
+        >>> bool(abs(js.volume(scene, shaped.height)) < 1e-9)
+        True
     """
     height = as_array("height", height)
     return follow(scene, height, _stroke(stroke, height.dtype), push=push, scheme=scheme, stop=stop)
@@ -83,21 +153,42 @@ def step(
 
 def follow(
     scene: Scene,
-    height: jax.typing.ArrayLike,
-    path: jax.typing.ArrayLike,
+    height: Float[ArrayLike, "H W"],
+    path: Float[ArrayLike, "n 2"],
     *,
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
-    """A path of legs without lifting the tool on a map [H, W] (m), then settling.
+    """Pushes along a path of straight legs without lifting the tool, then settles.
 
-    `path` [n, 2] holds x, y (m). The tool is lowered once, at the first point, and takes the sand in front of it along. At a
-    corner it turns in place about its centre, by the smaller angle, and a blade pushes what it sweeps ahead of its faces; a
-    reversal is half a turn, to the left. A leg of no length keeps the heading. What a turn leaves does not depend on how it
-    is divided into parts.
+    The tool is lowered once, at the first point, and carries the sand in front of it along from leg to leg. At a corner it
+    turns in place about its centre, by the smaller angle; a blade pushes what it sweeps ahead of its faces. A reversal is
+    half a turn, to the left. A leg of no length keeps the heading. On a map wider than the blade's heap, only a window
+    around the blade is computed; see `AsNeeded`. Differentiable like `step`, also in the path.
 
-    On a map wider than a blade's heap only a window around the blade is computed; see `AsNeeded`.
+    Args:
+        scene: the scene, with the tool.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2.
+        push: as of `step`.
+        scheme: as of `settle`.
+        stop: as of `settle`.
+
+    Returns:
+        The settled map, the outcome, the volume that drained, and the tool's last pose.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range, or the push does not go with the tool.
+        NotImplementedError: a second derivative is asked for.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> shaped = js.follow(scene, jnp.zeros((8, 8)), jnp.array([[0.02, 0.03], [0.06, 0.03], [0.06, 0.06]]))
+        >>> print(f"{shaped.pose.x:.2f} {shaped.pose.y:.2f} {shaped.pose.sin:.2f}")
+        0.06 0.06 1.00
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
@@ -106,14 +197,37 @@ def follow(
 
 def follow_frames(
     scene: Scene,
-    height: jax.typing.ArrayLike,
-    path: jax.typing.ArrayLike,
+    height: Float[ArrayLike, "H W"],
+    path: Float[ArrayLike, "n 2"],
     *,
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
-) -> tuple[Shaped, jax.Array]:
-    """`follow`, and the map after each leg, before the tool is lifted: [n - 1, H, W] (m)."""
+) -> tuple[Shaped, Float[Array, "n-1 H W"]]:
+    """`follow`, and the map after each leg, for animations.
+
+    Args:
+        scene: the scene, with the tool.
+        height: height map [H, W] (m).
+        path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2.
+        push: as of `step`.
+        scheme: as of `settle`.
+        stop: as of `settle`.
+
+    Returns:
+        The result of `follow`, and the maps [n - 1, H, W] (m) after each leg, while the tool is still in the sand.
+
+    Raises:
+        ValueError: as of `follow`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> shaped, frames = js.follow_frames(scene, jnp.zeros((8, 8)), jnp.array([[0.02, 0.04], [0.06, 0.04]]))
+        >>> frames.shape
+        (1, 8, 8)
+    """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
     return _as_needed(lambda scene, _: _follow(scene, height, path, rules, record=_itself), scene, rules, (height, path))
@@ -121,14 +235,41 @@ def follow_frames(
 
 def rollout(
     scene: Scene,
-    height: jax.typing.ArrayLike,
-    strokes: jax.typing.ArrayLike,
+    height: Float[ArrayLike, "H W"],
+    strokes: Float[ArrayLike, "n 4"],
     *,
     push: Push | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
-    """Pushes one after the other: `strokes` [n, 4] (m). Every field of the result gains a leading axis of length n."""
+    """Straight pushes one after the other, each followed by settling.
+
+    Push k acts on what push k - 1 left. The result holds the whole trajectory, `height[k]` after push k. Differentiable
+    like `step`.
+
+    Args:
+        scene: the scene, with the tool.
+        height: height map [H, W] (m) before the first push.
+        strokes: one row [4] = x0, y0, x1, y1 (m) for each push, [n, 4].
+        push: as of `step`.
+        scheme: as of `settle`.
+        stop: as of `settle`.
+
+    Returns:
+        The results of the n pushes; every field has an axis of length n in front.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range, or the push does not go with the tool.
+        NotImplementedError: a second derivative is asked for.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> strokes = jnp.array([[0.02, 0.04, 0.06, 0.04], [0.04, 0.02, 0.04, 0.06]])
+        >>> js.rollout(scene, jnp.zeros((8, 8)), strokes).height.shape
+        (2, 8, 8)
+    """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     strokes = as_array("strokes", strokes, height.dtype)
     if strokes.ndim != 2 or strokes.shape[1] != 4:
@@ -137,8 +278,10 @@ def rollout(
 
 
 def _as_needed(run: Callable[[Scene, Whole | Window], Any], scene: Scene, rules: Rules, arrays: tuple[Any, Any]) -> Any:
-    """What a run gives in a window around the blade, and settled in one around where it went, as wide as the sand asks for;
-    traced, in a window that is likely enough."""
+    """The result of `run(scene, settling window)` in the smallest window whose edge the sand does not reach.
+
+    While values are traced there is one try, in a window that is wide enough for most strokes.
+    """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, rules, arrays))):
         return run(next(windows_for(scene, rules[0], _SURE), scene), Whole())
     for part in windows_for(scene, rules[0]):
@@ -150,7 +293,7 @@ def _as_needed(run: Callable[[Scene, Whole | Window], Any], scene: Scene, rules:
 
 
 def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
-    """A window that holds a path, and what its blade's window holds at its ends, if the map is much wider."""
+    """A settling window that holds the path and the blade's window at its ends; Whole() unless the map is much wider."""
     far = float(np.max(np.ptp(np.asarray(path), axis=0))) / float(scene.grid.spacing)
     if isinstance(scheme, Multilevel) or not isinstance(scene.window, Window) or not far < max(scene.grid.shape):
         return Whole()
@@ -160,7 +303,13 @@ def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
 
 
 class OutcomeError(RuntimeError):
-    """A result that is not clean; its message says what to do."""
+    """The error that `check` raises; its message says what is wrong with a result and what to do.
+
+    Example:
+        >>> import jaxsand as js
+        >>> issubclass(js.OutcomeError, RuntimeError)
+        True
+    """
 
 
 _ADVICE = {
@@ -179,7 +328,26 @@ _ADVICE = {
 
 
 def check(result: Settled | Pushed) -> None:
-    """Raises `OutcomeError`, with advice, if the outcome of a result (or of any in a batch) is not clean. Host side."""
+    """Raises an error with advice if a computation did not end well.
+
+    Call it on results outside `jit`, `vmap` and `grad`: inside, outcomes are not known yet.
+
+    Args:
+        result: what `settle`, `step`, `follow`, `rollout`, `act` or their batches returned.
+
+    Raises:
+        OutcomeError: the outcome of the result, or of any in a batch, is not 0; see `Outcome`.
+        ValueError: the result is being traced.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> heap = jnp.zeros((8, 8)).at[4, 4].set(0.03)
+        >>> js.check(js.settle(js.make_scene((8, 8), 0.01), heap, stop=js.Sweeps(8)))
+        Traceback (most recent call last):
+            ...
+        jaxsand.interaction.simulate.OutcomeError: the sand is not still (...
+    """
     outcome = concrete(result.outcome)
     if outcome is None:
         raise ValueError("result: got a traced value; call check outside jit, vmap and grad")
@@ -197,17 +365,20 @@ def check(result: Settled | Pushed) -> None:
 
 
 def way_of(scene: Scene, push: Push) -> Any:
-    """How the push moves the scene's tool."""
+    """The function that moves the scene's tool as the push says: of a scene, a map, a path, the push and a recorder."""
     return _PUSHES[type(scene.tool), type(push)]
 
 
-def check_push(push: Any) -> None:
-    """Raises ValueError unless it is a way of pushing."""
+def check_push(push: object) -> None:
+    """Raises ValueError unless it is one of the pushes."""
     if not isinstance(push, Push):
         raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
 
 
-def ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple[Scene, jax.Array, Rules]:
+def ready(
+    scene: Scene, height: Float[ArrayLike, "H W"], push: Push | None, scheme: Scheme | None, stop: Stop | None
+) -> tuple[Scene, Float[Array, "H W"], Rules]:
+    """The checked arguments, with None replaced by defaults and every number cast to the height's dtype."""
     push = SteppedPush() if push is None else push
     check_push(push)
     if (type(scene.tool), type(push)) not in _PUSHES:
@@ -230,7 +401,8 @@ def ready(scene: Scene, height: Any, push: Any, scheme: Any, stop: Any) -> tuple
     return fitted, height, cast((push, scheme, stop), height.dtype)
 
 
-def _stroke(stroke: Any, dtype: Any) -> jax.Array:
+def _stroke(stroke: ArrayLike, dtype: DTypeLike) -> Float[Array, "2 2"]:
+    """The stroke's start and end as a path; ValueError if it has the wrong shape."""
     stroke = as_array("stroke", stroke, dtype)
     if stroke.shape != (4,):
         remedy = "use jax.vmap" if stroke.ndim > 1 and stroke.shape[-1] == 4 else "give x0, y0, x1, y1 in metres"
@@ -238,7 +410,7 @@ def _stroke(stroke: Any, dtype: Any) -> jax.Array:
     return stroke.reshape(2, 2)
 
 
-def _path(path: Any, dtype: Any) -> jax.Array:
+def _path(path: ArrayLike, dtype: DTypeLike) -> Float[Array, "n 2"]:
     path = as_array("path", path, dtype)
     if path.ndim != 2 or path.shape[0] < 2 or path.shape[1] != 2:
         remedy = "use jax.vmap" if path.ndim > 2 else "give at least two points [n, 2] of x, y in metres"
@@ -269,6 +441,7 @@ def _follow(
 
 
 def lifted(pushed: Pushed, settled: Settled) -> Shaped:
+    """The result of a push followed by settling."""
     outcome, drained = settled.outcome | pushed.outcome, settled.drained + pushed.drained
     return Shaped(**vars(replace(settled, outcome=outcome, drained=drained)), pose=pushed.pose)
 

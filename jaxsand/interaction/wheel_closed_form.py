@@ -1,4 +1,4 @@
-"""A wheel's pass in one go: its cut, and the sand of the cut in a pile on each side.
+"""A wheel's whole leg in closed form: its cut, and the sand of the cut in a pile on each side.
 
 The closed form's step before the sand flows (wheel_trench.py), as a push: in the way's frame the wheel cuts down to the
 lowest its rim comes to, here a parabola as deep as the sinkage h and as wide as the chord 2 s, and what was above stands
@@ -34,12 +34,26 @@ _TEN = math.radians(10)
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SplitPush:
-    """The cut of a wheel's leg, and its sand in two piles beside it, at once; for a `Wheel`.
+    """A wheel's whole leg at once, in closed form: its cut, and the sand of the cut in two piles beside it.
 
-    First order in the spacing. It works on the whole map, whatever the scene's window. Where there is no room for a pile
-    (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. The piles jump with the
-    slip angle at 80 degrees (and at 10, if the flanks cut more than the rim there). Else continuous and piecewise smooth in
-    the stroke, the wheel and the sand.
+    The cut is a parabola as deep as the sinkage h; the sand of each section stands beside the cut's edges in right triangles
+    at repose, of height sqrt(2 tan(repose_angle) A), A the area that their side gets. For a `Wheel`.
+
+    First order in the spacing. It computes the whole map, whatever the scene's window. Where there is no room for a pile
+    (a wall, the map's edge) its sand stays in the cut; nothing drains before the sand settles. The result is continuous and
+    piecewise smooth in the stroke, the wheel and the sand, except that the piles jump as the slip angle passes 80 degrees
+    (and 10 degrees, if the flanks cut more than the rim there).
+
+    Source:
+        Pavlov & Johnson, ICRA 2019; wheel_trench.py restates it.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Wheel(radius=0.03, width=0.02, sinkage=0.005))
+        >>> shaped = js.step(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]), push=js.SplitPush())
+        >>> bool(shaped.height[4, 4] < 0)
+        True
     """
 
 
@@ -57,7 +71,7 @@ def push_split(
 
 
 def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -> jax.Array:
-    """One leg: cuts, and sets down beside the cut what stood there, slice by slice along the way."""
+    """One leg: takes up the sand of the cut and sets it down in piles beside it, slice by slice along the leg."""
     dx, wheel = job.bed.spacing, job.tool
     pose, length = over_the_map(scene, job, pose, length)
     side = jnp.where(wheel.slip_angle < 0, -1, 1)
@@ -93,8 +107,8 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
 
 
 def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """The rim's and a flank's width of the cut (m), the share of its sand that goes to the flank's side, its floor's height
-    (m)."""
+    """The widths of the cut made by the rim and by a flank (m), the share of its sand that goes to the side of the leading
+    flank, and the height of its floor (m)."""
     slip = jnp.abs(wheel.slip_angle)
     rim, flank = wheel.width * jnp.cos(slip), half_chord(wheel) * jnp.sin(slip)
     flanks, middle = 4 / 3 * flank * wheel.sinkage, wheel.sinkage * rim
@@ -110,8 +124,10 @@ def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
 
 
 def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax.Array) -> jax.Array:
-    """The depth (m) of the cut once the area `behind` lies level in it: sinkage (1 - x^2) where middle x^2 + flanks x^3 is
-    that area, by Newton's steps from x = 1, the last of which carries the derivative."""
+    """The depth (m) of the cut after sand of the cross-section `behind` (m^2) was levelled in it.
+
+    It is sinkage (1 - x^2), middle x^2 + flanks x^3 = behind, by Newton's method, whose last step carries the derivative.
+    """
 
     def newton(_: Any, x: jax.Array) -> jax.Array:
         steep = 2 * middle * x + 3 * flanks * x * x
@@ -122,7 +138,7 @@ def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax
 
 
 def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Array, h: jax.Array) -> jax.Array:
-    """The mean height over each cell of the sand above the lowest that the wheel's bottom comes to, and above the floor."""
+    """The height of sand that the wheel cuts from each cell [H, W] (m): what lies above its lowest pass and the floor."""
     wheel = job.tool
     slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, half_chord(wheel)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
@@ -131,7 +147,11 @@ def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Arr
     slack = job.bed.spacing / (2 * _SAMPLES) * jnp.maximum(1 - 10 * sin, 0) / least_sin  # for samples at an upright flank
 
     def sample(k: jax.Array, total: jax.Array) -> jax.Array:
-        """Past s, n the wheel comes with c = u sin + n cos across, a = u cos - n sin along it, s - length <= u <= s."""
+        """Adds what is cut at one point of each cell.
+
+        The wheel passes the point (s, n) at a = u cos - n sin along its plane and c = u sin + n cos along its axle, with
+        s - length <= u <= s.
+        """
         offset = (jnp.stack([k // _SAMPLES, k % _SAMPLES]) + 0.5) / _SAMPLES - 0.5
         at, off = s + offset[0] * job.bed.spacing, n + offset[1] * job.bed.spacing
         near, far = (-half - off * cos) / least_sin, (half - off * cos) / least_sin

@@ -1,12 +1,14 @@
 """Settling: the sand flows until no slope is steeper than repose."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
 
 from jaxsand.relaxation._integrate import March, Sand, march
 from jaxsand.relaxation._multigrid import descend, start
@@ -26,51 +28,90 @@ from jaxsand.relaxation.ghost_cells import (
     unmark,
     volume_lost,
 )
-from jaxsand.relaxation.schemes import Multilevel, Scheme, SuperTimeStepping, schedule, stable_rate
+from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, schedule, stable_rate
 from jaxsand.relaxation.stopping import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
 from jaxsand.scene.scene import Scene, cast, fit
 from jaxsand.scene.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
 
 _WHOLE = Whole()
+OnOneGrid = Relaxation | Pairwise | SuperTimeStepping
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Settled:
-    """A settled map: `height` [H, W] (m), the `sweeps` it took, the largest slope in excess of repose left (`residual`, a
-    tangent), the `outcome` (bits of `Outcome`), and the volume that `drained` over the map's edge (m^3)."""
+    """A settled map, and how settling went. Of a batch, every field has the batch axis in front.
 
-    height: jax.Array
-    sweeps: jax.Array
-    residual: jax.Array
-    outcome: jax.Array
-    drained: jax.Array
+    Attributes:
+        height: height map [H, W] (m).
+        sweeps: number of sweeps that were taken.
+        residual: largest slope in excess of repose that is left, a tangent. It carries no derivative.
+        outcome: bits of `Outcome`; 0 when all went well. See `check`.
+        drained: volume that ran off over a draining edge (m^3).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> settled = js.settle(js.make_scene((8, 8), 0.01), jnp.zeros((8, 8)).at[4, 4].set(0.03))
+        >>> settled.height.shape, int(settled.outcome), float(settled.drained)
+        ((8, 8), 0, 0.0)
+    """
+
+    height: Float[Array, "*batch H W"]
+    sweeps: Int[Array, "*batch"]
+    residual: Float[Array, "*batch"]
+    outcome: Int[Array, "*batch"]
+    drained: Float[Array, "*batch"]
 
 
 def settle(
     scene: Scene,
-    height: jax.typing.ArrayLike,
+    height: Float[ArrayLike, "H W"],
     *,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     window: Whole | Window | None = None,
 ) -> Settled:
-    """Lets a map [H, W] (m) settle to its angle of repose. One map; batch with `jax.vmap` or `settle_batch`.
+    """Lets the sand of one map flow until no slope is steeper than repose.
 
-    Conserves volume up to what ghost_cells.py says of rounding, leaves a settled map as it is to the last bit, and
-    commutes with h -> -h, with mirrors and quarter turns (to rounding for isotropic sand and on coarse grids; not
-    `Pairwise`) and, up to the floats' spacing, with adding a constant. What else holds is said of each scheme.
+    Sand flows along dh/dt = -grad E(h) until the stop rule is satisfied; `scheme` says by which steps. For 4 or 8 neighbours
+    E sums the squared excess over repose of every link between two cells i and j at the distance l dx:
 
-    With a `window` it settles a block of that size around what is too steep. The outcome says WINDOW_EDGE if a slope
-    outside exceeds repose by more than the window's tolerance, or a cell within two cells of the block's edge (where that is
-    not the map's) ends more than the tolerance, in spacings, from where it began. With tolerance 0 and no such outcome the
-    map is the one that settling everywhere gives; with a tolerance it may also differ by what sand moves that is still to
-    that tolerance.
+        E(h) = sum over links of (d - clip(d, -m, m))^2 / (2 l),   d = h_j - h_i,   m = tan(repose_angle) l dx.
 
-    Computes in the height's dtype. Differentiable in the height and the angle of repose, by what `stop` says of itself.
+    Volume is conserved: to the last bit where heights are multiples of the rounding unit (see ghost_cells.py), else without
+    a drift. A map that is still is returned unchanged. Mirrored and quarter-turned maps give mirrored and turned results
+    (not with `Pairwise`). All is computed in the height's dtype. Differentiable once, in forward and reverse mode, in the
+    height, the angle of repose and the spacing, with the number of sweeps held fixed.
+
+    Args:
+        scene: grid, material, walls and edge; its tool plays no part.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx. Use `jax.vmap` or
+            `settle_batch` for many.
+        scheme: `SuperTimeStepping` (the default), `Multilevel`, `Relaxation` or `Pairwise`.
+        stop: `UntilStill` (the default) or `Sweeps`.
+        window: a `Window` settles only a block of its size around what is too steep; None or `Whole` settles the whole map.
+            The outcome says WINDOW_EDGE if a slope outside the block exceeds repose by more than the window's tolerance, or
+            if a cell within two cells of the block's edge moved by more than the tolerance, in spacings.
+
+    Returns:
+        The settled map, the number of sweeps, what is left above repose, the outcome, and the volume that drained.
 
     Raises:
-      ValueError: for a height of the wrong shape or dtype, or a scheme or stop rule out of range.
+        ValueError: the height has the wrong shape or dtype, or a scheme, stop rule or window is out of range.
+        NotImplementedError: a second derivative is asked for.
+
+    Source:
+        Eq. 1-2 of Kim, Pavlov & Johnson, arXiv:1908.02745, for the flow over a link.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01)
+        >>> heap = jnp.zeros((8, 8)).at[4, 4].set(0.03)
+        >>> settled = js.settle(scene, heap)
+        >>> print(f"{js.steepest_slope(scene, heap):.2f} {js.steepest_slope(scene, settled.height):.2f}")
+        3.00 0.55
     """
     scheme, stop = check_rule(scene, scheme, stop)
     window = check_settling_window(scene, scheme, window)
@@ -80,18 +121,40 @@ def settle(
 
 def settle_batch(
     scene: Scene,
-    height: jax.typing.ArrayLike,
+    height: Float[ArrayLike, "B H W"],
     *,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     window: Whole | Window | None = None,
     chunk: int | None = None,
 ) -> Settled:
-    """Lets a batch of maps [B, H, W] of one scene settle; every field of the result gains the batch axis.
+    """`settle` for a batch of maps of one scene, on every core.
 
-    Faster than `jax.vmap(settle)`: maps are taken in chunks, so that a slow map holds up only its own chunk and a chunk
-    stays in the cache, and the program is compiled for wide vectors on CPUs. For the same reason it is an outermost program:
-    call it as it is, not inside `jit`, `grad` or `vmap`.
+    It is faster than `jax.vmap` of `settle`: maps are settled in chunks that fit into a core's cache, a slow map does not
+    hold up the others, and the program is compiled for wide vectors. Call it from plain Python only, not inside `jit`,
+    `grad` or `vmap`, where `jax.vmap` of `settle` does the same.
+
+    Args:
+        scene: grid, material, walls and edge of all maps.
+        height: height maps [B, H, W] (m).
+        scheme: as of `settle`.
+        stop: as of `settle`.
+        window: as of `settle`.
+        chunk: number of maps that are settled together, 1 or more; None for what suits the machine.
+
+    Returns:
+        The settled maps; every field has the batch axis in front, `height` [B, H, W] and the others [B].
+
+    Raises:
+        ValueError: as of `settle`, or it is called inside `jit`, `grad` or `vmap`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> heaps = jnp.zeros((3, 8, 8)).at[:, 4, 4].set(jnp.array([0.0, 0.01, 0.03]))
+        >>> settled = js.settle_batch(js.make_scene((8, 8), 0.01), heaps)
+        >>> settled.height.shape, int(settled.sweeps[0])
+        ((3, 8, 8), 0)
     """
     scheme, stop = check_rule(scene, scheme, stop)
     window = check_settling_window(scene, scheme, window)
@@ -103,8 +166,30 @@ def settle_batch(
     return on_all_cores(program, (scene, scheme, stop, window), height, chunk)
 
 
-def steepest_slope(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
-    """The tangent of the steepest slope between neighbours of a map [H, W]."""
+def steepest_slope(scene: Scene, height: Float[ArrayLike, "H W"]) -> Float[Array, ""]:
+    """The steepest slope of a map, as the scene's neighbourhood measures slopes.
+
+    With 4 or 8 neighbours it is max |h_j - h_i| / (l dx) over all links, l dx the distance of the cells; for isotropic sand
+    it is the largest length of a one-sided gradient. Differentiable in the height and the spacing where one slope alone is
+    the steepest.
+
+    Args:
+        scene: spacing, neighbours and walls.
+        height: height map [H, W] (m).
+
+    Returns:
+        The tangent of the slope's angle, a scalar.
+
+    Raises:
+        ValueError: the height has the wrong shape or dtype.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> step = jnp.zeros((8, 8)).at[:, 4:].set(0.02)
+        >>> float(js.steepest_slope(js.make_scene((8, 8), spacing=0.01), step))
+        2.0
+    """
     return _steepest(*fit(scene, height))
 
 
@@ -113,8 +198,8 @@ def _steepest(scene: Scene, height: jax.Array) -> jax.Array:
     return steepest(prepare(scene), halo(mark(scene, height)[0]))
 
 
-def relax(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE) -> Settled:
-    """`settle` without its checks and casts, for use inside a program."""
+def relax(scene: Scene, height: Float[Array, "H W"], scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE) -> Settled:
+    """`settle` without its checks and casts, for use inside a compiled program."""
     bed = prepare(scene)
     sand = (halo(mark(scene, height)[0]), nothing_lost(bed, height))
     if isinstance(window, Window):
@@ -128,7 +213,7 @@ def relax(scene: Scene, height: jax.Array, scheme: Scheme, stop: Stop, window: W
 def _judge(
     scene: Scene, bed: Bed, stop: Stop, height: jax.Array, sand: Sand, sweeps: jax.Array, touched: jax.Array
 ) -> Settled:
-    """What there is to say of a map that was `height` and is now `sand`."""
+    """The result for a map that was `height` before settling and is now `sand`."""
     u, lost = sand
     marked, broken = mark(scene, height)
     residual = worst_excess(bed, u)
@@ -140,7 +225,7 @@ def _judge(
 
 
 def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tuple[Sand, jax.Array]:
-    """The sand at rest, or as far as the stop rule lets it go, and the sweeps that took."""
+    """The sand after the stop rule is satisfied, and the number of sweeps taken."""
     bound, interval = _groups(stop)
     if isinstance(scheme, Multilevel):
         tolerance = jnp.asarray(stop.tolerance)
@@ -148,16 +233,14 @@ def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tupl
     return _march(scene, bed, scheme, stop).run(bound // interval, sand)
 
 
-def _march(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop) -> March:
+def _march(scene: Scene, bed: Bed, scheme: OnOneGrid, stop: Stop) -> March:
     bound, interval = _groups(stop)
-    plan: Any = scheme
-    if isinstance(scheme, SuperTimeStepping):
-        plan = schedule(scheme, stable_rate(scene), bound, interval)
+    plan = schedule(scheme, stable_rate(scene), bound, interval) if isinstance(scheme, SuperTimeStepping) else scheme
     return march(bed, Nothing(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
 
 
 def _groups(stop: Stop) -> tuple[int, int]:
-    """The largest number of sweeps, and after how many of them to look."""
+    """The largest number of sweeps, and the number of sweeps between checks."""
     if isinstance(stop, Sweeps):
         return stop.count, next((n for n in range(8, 0, -1) if stop.count and stop.count % n == 0), 1)
     return stop.bound, min(stop.interval, stop.bound)
@@ -166,7 +249,7 @@ def _groups(stop: Stop) -> tuple[int, int]:
 def _in_window(
     scene: Scene, bed: Bed, window: Window, scheme: Scheme, stop: Stop, sand: Sand
 ) -> tuple[Sand, jax.Array, jax.Array]:
-    """`_run` on the block around what is too steep; also whether sand moves outside or came within two cells of its edge."""
+    """`_run` on the block around what is too steep; also whether sand moves outside of it or near its edge."""
     u, lost = sand
     shape, h = scene.grid.shape, at(u)
     begin = origin(window, shape, middle(bed, u, jnp.asarray(stop.tolerance)))
@@ -184,7 +267,7 @@ def _in_window(
 _settle = jax.jit(relax)
 
 
-def relax_batch(rules: tuple[Scene, Scheme, Stop, Whole | Window], height: jax.Array, *, chunk: int) -> Settled:
+def relax_batch(rules: tuple[Scene, Scheme, Stop, Whole | Window], height: Float[Array, "B H W"], *, chunk: int) -> Settled:
     """`relax` for a batch of maps [B, H, W], B a multiple of the chunk."""
     scene, scheme, stop, window = rules
     if isinstance(window, Window) or isinstance(scheme, Multilevel):
@@ -200,5 +283,5 @@ def relax_batch(rules: tuple[Scene, Scheme, Stop, Whole | Window], height: jax.A
 
 
 @cache
-def _batch_program() -> Any:
+def _batch_program() -> Callable[..., Settled]:
     return jax.jit(relax_batch, static_argnames="chunk", compiler_options=wide_vectors())

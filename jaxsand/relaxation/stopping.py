@@ -1,12 +1,13 @@
-"""What settling is told, and what it says: stop rules, outcomes, and the checks of both."""
+"""Stop rules, outcomes, and the checks of the options of settling and pushing."""
 
 from dataclasses import dataclass, field
 from enum import IntFlag
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
 from jaxsand.scene.scene import Scene, as_array, check_window, concrete
@@ -16,34 +17,57 @@ _MOST = 1_000_000_000  # sweeps, which are counted in 32 bits
 
 
 class Outcome(IntFlag):
-    """What a result has to say for itself; 0 is a clean one. See `check`."""
+    """What went wrong in a computation, as bits; 0 when nothing did. `check` turns it into an error with advice.
+
+    Attributes:
+        NOT_STILL: some slope still exceeds repose by more than the stop rule's tolerance.
+        WINDOW_EDGE: sand moved at the edge of a window, so that the result may differ from that of the whole map.
+        NOT_FINITE: the map, the stroke or the scene holds a NaN or an infinity, heights overflowed, or the stroke lies
+            farther away than floats resolve. A bad cell of the map was treated as solid and is returned as it was.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.Outcome(3)
+        <Outcome.NOT_STILL|WINDOW_EDGE: 3>
+        >>> js.Outcome.NOT_FINITE in js.Outcome(3)
+        False
+    """
 
     NOT_STILL = 1
-    """Some slope is still steeper than repose by more than the tolerance."""
     WINDOW_EDGE = 2
-    """Sand moved at the edge of the window, of the scene's while the tool was down or of the one that was to settle."""
     NOT_FINITE = 4
-    """The map, the stroke or the scene holds a NaN or an infinity, the heights overflowed, or the stroke lies farther away
-    than the floats resolve. A bad cell of the map was treated as solid and given back as it was."""
 
 
-def said(outcome: Outcome, yes: jax.Array) -> jax.Array:
-    """The outcome's bit where there is something to say, 0 elsewhere (int32)."""
+def said(outcome: Outcome, yes: Bool[Array, "..."]) -> Int[Array, "..."]:
+    """The outcome's bit where the condition `yes` holds, 0 elsewhere (int32)."""
     return jnp.where(yes, jnp.int32(outcome), jnp.int32(0))
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class UntilStill:
-    """Sweep until no slope (a tangent) exceeds repose by more than `tolerance`, at most `bound` sweeps (`Multilevel`: on
-    every grid, down and up).
+    """Sweep until the sand is still: no slope exceeds repose by more than the tolerance. The default stop rule.
 
-    Looks every `interval` sweeps, so that the number of sweeps is a multiple of it (and 0 on a map that is still). Where the
-    floats are too coarse to move sand down to the tolerance (large offsets in float32), it stops when nothing moves any more
-    and the outcome says NOT_STILL. Differentiable once, in forward and reverse mode (see `loop.repeat_until`).
+    A slope is a tangent, and repose is tan(repose_angle). Stillness is checked every `interval` sweeps, so that the number
+    of sweeps is a multiple of `interval`, and 0 on a map that is still. Where floats are too coarse to move sand down to the
+    tolerance (large heights in float32), sweeping stops when nothing moves any more, and the outcome says NOT_STILL.
+    Settling is differentiable once, in forward and reverse mode, with the number of sweeps held fixed.
+
+    Attributes:
+        tolerance: slope above repose that counts as still, 0 or more.
+        bound: largest number of sweeps (`Multilevel`: on each grid, on the way down and up); static.
+        interval: number of sweeps between checks; static.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01)
+        >>> heap = jnp.zeros((8, 8)).at[4, 4].set(0.03)
+        >>> bool(js.settle(scene, heap, stop=js.UntilStill(tolerance=0.01)).residual <= 0.01)
+        True
     """
 
-    tolerance: jax.Array | float = 1e-3
+    tolerance: Float[Array, ""] | float = 1e-3
     bound: int = field(default=20_000, metadata={"static": True})
     interval: int = field(default=8, metadata={"static": True})
 
@@ -51,17 +75,31 @@ class UntilStill:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sweeps:
-    """Exactly `count` sweeps; `tolerance` only judges the outcome. Differentiable once, in forward and reverse mode."""
+    """Sweep a fixed number of times, whether or not the sand is still.
+
+    Settling is differentiable once, in forward and reverse mode. Not for `Multilevel`.
+
+    Attributes:
+        count: number of sweeps; static.
+        tolerance: slope above repose beyond which the outcome says NOT_STILL.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> heap = jnp.zeros((8, 8)).at[4, 4].set(0.03)
+        >>> int(js.settle(js.make_scene((8, 8), 0.01), heap, stop=js.Sweeps(8)).sweeps)
+        8
+    """
 
     count: int = field(metadata={"static": True})
-    tolerance: jax.Array | float = 1e-3
+    tolerance: Float[Array, ""] | float = 1e-3
 
 
 Stop = UntilStill | Sweeps
 
 
 def check_rule(scene: Scene, scheme: Scheme | None, stop: Stop | None) -> tuple[Scheme, Stop]:
-    """The scheme and stop rule, by default SuperTimeStepping() and UntilStill(), if they are in range."""
+    """The scheme and stop rule, with None replaced by SuperTimeStepping() and UntilStill(); ValueError if out of range."""
     scheme = SuperTimeStepping() if scheme is None else scheme
     stop = UntilStill() if stop is None else stop
     _check_scheme(scene, scheme)
@@ -103,7 +141,8 @@ def _check_scheme(scene: Scene, scheme: Scheme) -> None:
         raise ValueError(f"scheme: got {scheme!r}; give Relaxation, Pairwise, SuperTimeStepping or Multilevel")
 
 
-def check_settling_window(scene: Scene, scheme: Scheme, window: Any) -> Whole | Window:
+def check_settling_window(scene: Scene, scheme: Scheme, window: Whole | Window | None) -> Whole | Window:
+    """The window in which to settle, with None replaced by Whole(); ValueError if it does not go with scene or scheme."""
     window = Whole() if window is None else window
     check_window(window, scene.grid.shape)
     if isinstance(window, Window) and isinstance(scheme, Pairwise | Multilevel):
@@ -112,8 +151,8 @@ def check_settling_window(scene: Scene, scheme: Scheme, window: Any) -> Whole | 
     return window
 
 
-def check_rate(scene: Scene, name: str, value: jax.typing.ArrayLike) -> None:
-    """Raises ValueError unless a rate is positive and in the scene's stable range."""
+def check_rate(scene: Scene, name: str, value: Float[ArrayLike, ""]) -> None:
+    """Raises ValueError unless a rate is positive and stable in the scene."""
     _check_number(name, value)
     rate = concrete(value)
     limit = stable_rate(scene)
@@ -123,8 +162,8 @@ def check_rate(scene: Scene, name: str, value: jax.typing.ArrayLike) -> None:
         raise ValueError(f"{name}: got {value!r}, unstable above {limit:.4f}; the paper uses 0.125")
 
 
-def as_batch(height: jax.typing.ArrayLike) -> jax.Array:
-    """The height as an array, if it is a batch [B, H, W]."""
+def as_batch(height: Float[ArrayLike, "B H W"]) -> Float[Array, "B H W"]:
+    """The height as an array; raises ValueError unless it is a batch [B, H, W] of at least one map."""
     height = as_array("height", height)
     if height.ndim != 3 or not height.shape[0]:
         raise ValueError(f"height: got shape {list(height.shape)}; give a batch of at least one map [B, H, W]")
@@ -137,7 +176,7 @@ def check_chunk(chunk: int | None) -> None:
         check_whole("chunk", chunk, 1)
 
 
-def check_whole(name: str, value: Any, least: int, most: int | None = None) -> None:
+def check_whole(name: str, value: object, least: int, most: int | None = None) -> None:
     """Raises ValueError unless the value is a whole number from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name}: got {value!r}; give a whole number of at least {least}")
@@ -145,7 +184,7 @@ def check_whole(name: str, value: Any, least: int, most: int | None = None) -> N
         raise ValueError(f"{name}: got {value!r}; give at most {most:,}")
 
 
-def _check_number(name: str, value: Any) -> None:
+def _check_number(name: str, value: ArrayLike) -> None:
     try:
         single = jnp.ndim(value) == 0 and jnp.issubdtype(jnp.result_type(value), jnp.number)
     except TypeError:

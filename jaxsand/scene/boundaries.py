@@ -3,31 +3,77 @@
 from dataclasses import dataclass
 
 import jax
+from jaxtyping import Array, Bool, Float
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Open:
-    """No cell is solid (neutral)."""
+    """No cell is solid: a map without walls, the default of `make_scene`.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.make_scene((8, 8), 0.01).walls
+        Open()
+    """
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Walls:
-    """Cells where `solid` [H, W] is true hold no sand and let none through; their height is left as it is."""
+    """Solid cells, which hold no sand and let none through.
 
-    solid: jax.Array
+    The height of a solid cell is never used and is returned unchanged.
+
+    Attributes:
+        solid: booleans [H, W], true where the cell is solid.
+
+    Example:
+        A wall along column 4 keeps a heap on its own side.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> solid = jnp.zeros((8, 8), bool).at[:, 4].set(True)
+        >>> scene = js.make_scene((8, 8), 0.01, walls=js.Walls(solid))
+        >>> heap = jnp.zeros((8, 8)).at[4, 1].set(0.03)
+        >>> float(abs(js.settle(scene, heap).height[:, 5:]).max())
+        0.0
+    """
+
+    solid: Bool[Array, "H W"]
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Closed:
-    """A wall stands along the map's edge: no sand leaves (neutral)."""
+    """A wall stands along the map's edge, so that no sand leaves: the default of `make_scene`.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.make_scene((8, 8), 0.01).edge
+        Closed()
+    """
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Draining:
-    """Sand runs off over the map's edge, whose rim stands at height `level` (m), half a spacing beyond the outer cells."""
+    """Sand runs off over the map's edge, whose rim stands half a spacing beyond the centres of the outer cells.
 
-    level: jax.Array | float = 0.0
+    Sand flows over the rim where it stands higher than repose against it. Results count what left in `drained` (m^3).
+
+    Attributes:
+        level: height of the rim (m), a scalar.
+
+    Example:
+        A corner cell drains over two sides until it stands at repose against the rim.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, edge=js.Draining(level=0.0))
+        >>> settled = js.settle(scene, jnp.zeros((8, 8)).at[0, 0].set(0.03))
+        >>> bool(settled.drained > 0)
+        True
+    """
+
+    level: Float[Array, ""] | float = 0.0

@@ -6,6 +6,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 Neighbours = Literal[4, 8, "isotropic"]
 Link = tuple[int, int, float]
@@ -18,21 +19,34 @@ _LINKS = {4: _STRAIGHT, 8: _STRAIGHT + _DIAGONAL, "isotropic": _STRAIGHT}
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Grid:
-    """A rectangular grid of square cells, row 0 at y = 0: cell [i, j] is centred at ((j + 1/2) dx, (i + 1/2) dx)."""
+    """A rectangular grid of square cells; row 0 lies at y = 0.
 
-    spacing: jax.Array | float  # m, []
-    shape: tuple[int, int] = field(metadata={"static": True})  # rows, columns
+    Cell [i, j] is centred at x = (j + 1/2) dx, y = (i + 1/2) dx, dx the spacing. `make_scene` builds a grid and checks it.
+
+    Attributes:
+        spacing: distance dx of neighbouring cell centres (m), a scalar.
+        shape: number of rows and of columns; static.
+        neighbours: between which cells the angle of repose holds; static. 4: along rows and columns. 8: also along
+            diagonals, sqrt(2) dx apart. "isotropic": for the length of the gradient, in whichever direction it points.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.make_scene((8, 16), 0.01).grid
+        Grid(spacing=0.01, shape=(8, 16), neighbours=8)
+    """
+
+    spacing: Float[Array, ""] | float
+    shape: tuple[int, int] = field(metadata={"static": True})
     neighbours: Neighbours = field(default=8, metadata={"static": True})
 
 
 def links(neighbours: Neighbours) -> tuple[Link, ...]:
-    """Half of the links over which a cell exchanges sand: (rows, columns, length in spacings). The others are their
-    negatives."""
+    """The links over which a cell exchanges sand, as (rows, columns, length in spacings); one of each opposite pair."""
     return _LINKS[neighbours]
 
 
-def centres(grid: Grid, dtype: jax.typing.DTypeLike) -> tuple[jax.Array, jax.Array]:
-    """Cell centres in m: x [1, W] and y [H, 1], to be broadcast."""
+def centres(grid: Grid, dtype: jax.typing.DTypeLike) -> tuple[Float[Array, "1 W"], Float[Array, "H 1"]]:
+    """The coordinates x and y of the cell centres (m), which broadcast to [H, W]."""
     rows, columns = grid.shape
     dx = jnp.asarray(grid.spacing, dtype)
     x = (jnp.arange(columns, dtype=dtype) + 0.5) * dx

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, Float
 
 from jaxsand.scene.boundaries import Closed, Draining, Open, Walls
 from jaxsand.scene.grid import Grid, Neighbours
@@ -14,11 +16,38 @@ from jaxsand.scene.material import DRY_SAND, Material
 from jaxsand.scene.tools import Blade, Grousers, NoTool, Smooth, Wheel
 from jaxsand.scene.window import AsNeeded, Whole, Window
 
+T = TypeVar("T")
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Scene:
-    """Grid, material, walls, edge, window and tool; each has a neutral member that costs nothing. See `make_scene`."""
+    """Everything about the sand except its height: the grid, the material, what bounds the sand, and the tool.
+
+    Build one with `make_scene`, which checks it. A scene is a pytree. Angles, lengths and depths are leaves, which
+    `jax.vmap` batches and `jax.grad` differentiates by; sizes and alternatives are static. What is left out is not compiled.
+
+    Attributes:
+        grid: cells and their neighbours.
+        material: the sand's angle of repose.
+        walls: `Open`, or `Walls` with solid cells.
+        edge: `Closed`, or `Draining` with sand running off over the map's edge.
+        window: which part of the map is computed: `AsNeeded`, `Whole` or `Window`.
+        tool: `NoTool`, `Blade` or `Wheel`.
+
+    Example:
+        A batch of scenes with three angles of repose, each with its own map:
+
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scenes = jax.vmap(lambda angle: js.make_scene((8, 8), 0.01, angle))(jnp.array([0.4, 0.5, 0.6]))
+        >>> scenes.material.repose_angle.shape
+        (3,)
+        >>> axes = jax.tree.map(lambda _: 0, scenes)
+        >>> jax.vmap(js.steepest_slope, in_axes=(axes, None))(scenes, jnp.zeros((8, 8))).shape
+        (3,)
+    """
 
     grid: Grid
     material: Material = DRY_SAND
@@ -30,8 +59,8 @@ class Scene:
 
 def make_scene(
     shape: tuple[int, int],
-    spacing: jax.typing.ArrayLike,
-    repose_angle: jax.typing.ArrayLike = DRY_SAND.repose_angle,
+    spacing: Float[ArrayLike, ""],
+    repose_angle: Float[ArrayLike, ""] | Float[ArrayLike, "H W"] = DRY_SAND.repose_angle,
     neighbours: Neighbours = 8,
     *,
     tool: NoTool | Blade | Wheel | None = None,
@@ -39,17 +68,36 @@ def make_scene(
     edge: Closed | Draining | None = None,
     window: AsNeeded | Whole | Window | None = None,
 ) -> Scene:
-    """A checked scene.
+    """Builds a scene and checks every value in it.
 
     Args:
-      shape: rows and columns of the height map.
-      spacing: distance of neighbouring cell centres, m.
-      repose_angle: rad, above 0 and below pi/2; a scalar or one per cell [H, W].
-      neighbours: 4, 8 (diagonal links are sqrt(2) spacings long), or "isotropic" (repose holds for the gradient's length).
-      tool, walls, edge, window: what the scene has of these; by default nothing.
+        shape: number of rows and of columns of the height maps, H and W.
+        spacing: distance dx of neighbouring cell centres (m). Cell [i, j] is centred at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        repose_angle: angle of repose (rad), above 0 and below pi/2: a scalar, or one angle per cell [H, W].
+        neighbours: between which cells repose holds: 4, 8 (diagonal neighbours are sqrt(2) dx apart), or "isotropic" (the
+            length of the gradient is limited).
+        tool: a `Blade` or a `Wheel`; None for no tool.
+        walls: `Walls` with solid cells; None for none.
+        edge: `Draining` where sand runs off over the map's edge; None for a closed edge.
+        window: `Window` or `Whole`, the part of the map that is computed; None for `AsNeeded`.
+
+    Returns:
+        The scene, for `settle`, `step` and the other functions of this package.
 
     Raises:
-      ValueError: names the field, the value and the remedy. Values that are being traced (jit, vmap, grad) are not checked.
+        ValueError: a value is out of range; the message names the field, the value and the remedy. Values that are being
+            traced (inside `jit`, `vmap` or `grad`) are not checked.
+
+    Example:
+        >>> import math
+        >>> import jaxsand as js
+        >>> scene = js.make_scene(shape=(8, 8), spacing=0.01, repose_angle=math.radians(29), tool=js.Blade())
+        >>> scene.grid.shape
+        (8, 8)
+        >>> js.make_scene((8, 8), spacing=-1)
+        Traceback (most recent call last):
+            ...
+        ValueError: spacing: got -1; it must be one finite number above 0: ...
     """
     shape = _shape(shape)
     _positive("spacing", spacing, "give the distance of cell centres in metres, such as 0.01")
@@ -73,20 +121,34 @@ def make_scene(
 
 
 def blade_of(scene: Scene) -> Blade:
-    """The scene's blade.
-
-    Raises:
-      ValueError: if its tool is none.
-    """
+    """The scene's blade; raises ValueError if its tool is another."""
     if not isinstance(scene.tool, Blade):
         raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
     return scene.tool
 
 
-def volume(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
-    """Volume of the sand above height 0 (m^3): dx^2 times the sum over the cells that are not solid. Differentiable.
+def volume(scene: Scene, height: Float[ArrayLike, "H W"]) -> Float[Array, ""]:
+    """The volume of the sand above height 0, less what is missing below it.
 
-    Summed in the height's dtype; `jaxsand.task.volume_error` tells in float64 whether sand was lost.
+    volume = dx^2 * (sum of the heights of all cells that are not solid), summed in the height's dtype. To tell whether sand
+    was lost, use `jaxsand.task.volume_error`, which sums in float64. Differentiable in the height and the spacing.
+
+    Args:
+        scene: the scene, which gives the spacing dx and the solid cells.
+        height: height map [H, W] (m).
+
+    Returns:
+        The volume (m^3), a scalar.
+
+    Raises:
+        ValueError: the height has the wrong shape or is not a floating-point array.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), spacing=0.01)
+        >>> print(f"{js.volume(scene, jnp.full((8, 8), 0.1)):.6f}")
+        0.000640
     """
     scene, height = fit(scene, height)
     if isinstance(scene.walls, Walls):
@@ -94,8 +156,8 @@ def volume(scene: Scene, height: jax.typing.ArrayLike) -> jax.Array:
     return jnp.sum(jnp.sum(height, axis=0)) * jnp.asarray(scene.grid.spacing, height.dtype) ** 2
 
 
-def fit(scene: Scene, height: jax.typing.ArrayLike) -> tuple[Scene, jax.Array]:
-    """The height as a float array of the scene's shape, and the scene with every float cast to the height's dtype."""
+def fit(scene: Scene, height: Float[ArrayLike, "H W"]) -> tuple[Scene, Float[Array, "H W"]]:
+    """The scene with every float cast to the height's dtype, and the height as an array; ValueError if it is unfit."""
     height = as_array("height", height)
     if not jnp.issubdtype(height.dtype, jnp.floating):
         raise ValueError(f"height: got dtype {height.dtype}; convert it to float32 or float64 metres")
@@ -114,8 +176,8 @@ def fit(scene: Scene, height: jax.typing.ArrayLike) -> tuple[Scene, jax.Array]:
     return cast(scene, height.dtype), height
 
 
-def as_array(name: str, value: Any, dtype: Any = None) -> jax.Array:
-    """The value as an array, or a ValueError that names it."""
+def as_array(name: str, value: ArrayLike, dtype: DTypeLike | None = None) -> jax.Array:
+    """The value as an array; raises a ValueError that bears the name if it is none."""
     try:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError) as error:
@@ -123,10 +185,10 @@ def as_array(name: str, value: Any, dtype: Any = None) -> jax.Array:
         raise ValueError(f"{name}: got {type(value).__name__}, no array of numbers ({reason}); give numbers") from None
 
 
-def cast(tree: Any, dtype: jax.typing.DTypeLike) -> Any:
-    """Every float leaf as an array of `dtype`, so that 0.5, np.float32(0.5) and an array of it share one program."""
+def cast(tree: T, dtype: DTypeLike) -> T:
+    """The tree with every number as an array of `dtype`, so that 0.5, np.float32(0.5) and an array share one program."""
 
-    def one(leaf: Any) -> Any:
+    def one(leaf: ArrayLike) -> jax.Array:
         if jnp.issubdtype(jnp.result_type(leaf), jnp.bool_):
             return jnp.asarray(leaf)
         return jnp.asarray(leaf, dtype)
@@ -134,8 +196,8 @@ def cast(tree: Any, dtype: jax.typing.DTypeLike) -> Any:
     return jax.tree.map(one, tree)
 
 
-def concrete(value: Any) -> np.ndarray | None:
-    """The value as a numpy array, or None while it is being traced."""
+def concrete(value: object) -> np.ndarray | None:
+    """The value as a numpy array (NaN for what is no number), or None if it is being traced."""
     if isinstance(value, jax.core.Tracer):
         return None
     try:
@@ -145,11 +207,11 @@ def concrete(value: Any) -> np.ndarray | None:
     return array if array.dtype.kind in "fiub" else np.full((), np.nan)
 
 
-def _number(value: Any) -> Any:
+def _number(value: ArrayLike) -> Any:
     return float(value) if isinstance(value, (int, float)) else value
 
 
-def _shape(shape: Any) -> tuple[int, int]:
+def _shape(shape: tuple[int, int]) -> tuple[int, int]:
     try:
         rows, columns = shape
         good = all(int(n) == n and not isinstance(n, bool) and n >= 1 for n in (rows, columns))
@@ -160,13 +222,13 @@ def _shape(shape: Any) -> tuple[int, int]:
     return int(rows), int(columns)
 
 
-def _positive(name: str, value: Any, remedy: str) -> None:
+def _positive(name: str, value: object, remedy: str) -> None:
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array) and array > 0):
         raise ValueError(f"{name}: got {_short(value)}; it must be one finite number above 0: {remedy}")
 
 
-def _finite(name: str, value: Any, remedy: str) -> None:
+def _finite(name: str, value: object, remedy: str) -> None:
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array)):
         raise ValueError(f"{name}: got {_short(value)}; it must be one finite number: {remedy}")
@@ -176,7 +238,7 @@ def _short(value: Any) -> str:
     return repr(value) if np.ndim(value) == 0 else f"an array of shape {list(np.shape(value))}"
 
 
-def _angle(angle: Any, shape: tuple[int, int]) -> None:
+def _angle(angle: object, shape: tuple[int, int]) -> None:
     array = concrete(angle)
     if array is None:
         return
@@ -189,11 +251,11 @@ def _angle(angle: Any, shape: tuple[int, int]) -> None:
         raise ValueError(f"repose_angle: got shape {list(array.shape)}; give one number or a map of shape {list(shape)}")
 
 
-def _as_walls(walls: Any) -> Any:
+def _as_walls(walls: Open | Walls) -> Open | Walls:
     return Walls(jnp.asarray(walls.solid)) if isinstance(walls, Walls) and not hasattr(walls.solid, "dtype") else walls
 
 
-def _check_walls(walls: Any, shape: tuple[int, int]) -> None:
+def _check_walls(walls: object, shape: tuple[int, int]) -> None:
     if isinstance(walls, Walls):
         solid = concrete(walls.solid)
         if solid is not None and (solid.dtype != bool or solid.shape != shape):
@@ -205,14 +267,15 @@ def _check_walls(walls: Any, shape: tuple[int, int]) -> None:
         raise ValueError(f"walls: got {got}; give Open() or Walls(solid)")
 
 
-def _check_edge(edge: Any) -> None:
+def _check_edge(edge: object) -> None:
     if isinstance(edge, Draining):
         _finite("edge.level", edge.level, "give the height of the rim in metres")
     elif not isinstance(edge, Closed):
         raise ValueError(f"edge: got {edge!r}; give Closed() or Draining(level)")
 
 
-def check_window(window: Any, shape: tuple[int, int]) -> None:
+def check_window(window: object, shape: tuple[int, int]) -> None:
+    """Raises ValueError unless it is a window that fits on a map of this shape."""
     if isinstance(window, Window):
         try:
             inside = len(window.size) == 2 and all(
@@ -231,7 +294,7 @@ def check_window(window: Any, shape: tuple[int, int]) -> None:
         raise ValueError(f"window: got {window!r}; give AsNeeded(), Whole() or Window(size)")
 
 
-def _check_tool(tool: Any, grid: Grid) -> None:
+def _check_tool(tool: object, grid: Grid) -> None:
     if isinstance(tool, Blade):
         _positive("tool.width", tool.width, "give the blade's width in metres")
         _positive("tool.thickness", tool.thickness, "give the blade's thickness in metres")

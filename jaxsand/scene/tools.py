@@ -1,77 +1,127 @@
-"""Tools: their geometry, and how much of each cell they cover."""
+"""Tools: their geometry, their poses, and the share of each cell that they cover."""
 
 import math
 from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+Scalar = Float[Array, ""]
+Number = Scalar | float
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class NoTool:
-    """Nothing touches the sand (neutral)."""
+    """No tool: nothing touches the sand, the default of `make_scene`.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.make_scene((8, 8), 0.01).tool
+        NoTool()
+    """
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Blade:
-    """A flat blade pushed perpendicular to itself, its bottom edge at height -depth (m) while it is lowered.
+    """A flat upright blade that is pushed perpendicular to its face.
 
-    `width` (m) lies across the direction of travel, `thickness` (m) along it. `depth` is measured from height 0, not
-    from the sand: a blade of negative depth passes above a level map.
+    While it is lowered, its bottom edge is at height -depth. The depth is measured from height 0 and not from the surface
+    of the sand, so that a blade of negative depth passes above a level map of height 0.
+
+    Attributes:
+        width: extent across the direction of travel (m), at least one cell.
+        thickness: extent along the direction of travel (m), at least one cell.
+        depth: depth of the bottom edge below height 0 (m).
+
+    Example:
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade(width=0.03, thickness=0.015, depth=0.005))
+        >>> scene.tool.width
+        0.03
     """
 
-    width: jax.Array | float = 0.02
-    thickness: jax.Array | float = 0.015
-    depth: jax.Array | float = 0.0075
+    width: Number = 0.02
+    thickness: Number = 0.015
+    depth: Number = 0.0075
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Smooth:
-    """A rim without grousers, or a wheel that is towed without turning (neutral)."""
+    """A wheel whose rim carries no sand to behind it: it has no grousers, or does not turn. The default of `Wheel`.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.Wheel().grousers
+        Smooth()
+    """
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Grousers:
-    """Bars across a wheel's rim, `height` (m) high, that carry sand to behind the wheel.
+    """Bars across the rim of a turning wheel, which carry sand to behind the wheel.
 
-    What they carry comes to lie in the cut behind the wheel: to a metre of travel spin * width * height * fill (m^3), as far
-    as that much is displaced. `fill` is the share of the space between them that sand takes up, `spin` the rim's speed over
-    the wheel's: 1 / (1 - i) for a wheel driven at the slip ratio i.
+    For each metre of travel they set down spin * width * height * fill (m^3) in the cut behind the wheel, where width is the
+    wheel's; at most what the wheel displaces.
+
+    Attributes:
+        height: how far the bars stand out of the rim (m).
+        fill: share of the space between the bars that sand fills, usually 0 to 1.
+        spin: speed of the rim over the speed of travel: 1 / (1 - i) for a wheel driven at the slip ratio i.
+
+    Example:
+        >>> import jaxsand as js
+        >>> driven = js.Wheel(grousers=js.Grousers(height=0.005, fill=0.1, spin=1 / (1 - 0.2)))
+        >>> driven.grousers.spin
+        1.25
     """
 
-    height: jax.Array | float = 0.005
-    fill: jax.Array | float = 0.1
-    spin: jax.Array | float = 1.0
+    height: Number = 0.005
+    fill: Number = 0.1
+    spin: Number = 1.0
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel towed or driven at a fixed sinkage, its plane at an angle to its way.
+    """A wheel that is towed or driven at a fixed sinkage, with its plane at an angle to the direction of travel.
 
-    `radius`, `width` and `sinkage` in m; the lowest point of the rim is at height -sinkage. `slip_angle` (rad) turns from
-    the wheel's plane to its way, counter-clockwise: at pi/2 the wheel is dragged sideways, to its left. The defaults are
-    those of arXiv:1908.02745.
+    The lowest point of its rim is at height -sinkage. The defaults are those of arXiv:1908.02745.
+
+    Attributes:
+        radius: radius of the rim (m).
+        width: width of the rim (m).
+        sinkage: depth of the lowest point below height 0 (m), above 0 and at most the radius.
+        slip_angle: angle from the wheel's plane to the direction of travel (rad), counter-clockwise, -pi/2 to pi/2. At
+            pi/2 the wheel is dragged sideways, to its left.
+        grousers: `Smooth`, or `Grousers` that carry sand to behind the wheel.
+
+    Example:
+        >>> import math
+        >>> import jaxsand as js
+        >>> wheel = js.Wheel(radius=0.03, width=0.02, sinkage=0.005, slip_angle=math.radians(30))
+        >>> js.make_scene((8, 8), 0.01, tool=wheel).tool.sinkage
+        0.005
     """
 
-    radius: jax.Array | float = 0.048
-    width: jax.Array | float = 0.05
-    sinkage: jax.Array | float = 0.015
-    slip_angle: jax.Array | float = 0.0
+    radius: Number = 0.048
+    width: Number = 0.05
+    sinkage: Number = 0.015
+    slip_angle: Number = 0.0
     grousers: Smooth | Grousers = field(default_factory=Smooth)
 
 
-def lowest(tool: Blade | Wheel) -> jax.Array:
+def lowest(tool: Blade | Wheel) -> Scalar:
     """The height of the tool's lowest point (m)."""
     return -jnp.asarray(tool.sinkage if isinstance(tool, Wheel) else tool.depth)
 
 
-def usable(tool: NoTool | Blade | Wheel) -> jax.Array:
-    """Whether the tool's numbers are finite and, for a wheel, make one; what is traced escapes `make_scene`."""
+def usable(tool: NoTool | Blade | Wheel) -> Bool[Array, ""]:
+    """Whether the tool's numbers are finite and, for a wheel, in range; checks traced values, which `make_scene` cannot."""
     good = jnp.ones((), bool)
     for leaf in jax.tree.leaves(tool):
         good = good & jnp.all(jnp.isfinite(leaf))
@@ -81,24 +131,24 @@ def usable(tool: NoTool | Blade | Wheel) -> jax.Array:
     return good
 
 
-def half_chord(wheel: Wheel) -> jax.Array:
+def half_chord(wheel: Wheel) -> Scalar:
     """Half of the wheel's chord at level sand, s = sqrt(h (2 r - h)) (m); at least a thousandth of the radius."""
     r = jnp.asarray(wheel.radius)
     return jnp.sqrt(jnp.maximum(wheel.sinkage * (2 * r - wheel.sinkage), 1e-6 * r * r))
 
 
-def carried_area(wheel: Wheel, grousers: Grousers) -> jax.Array:
-    """What the grousers of a wheel carry to behind it to a unit of travel (m^2)."""
+def carried_area(wheel: Wheel, grousers: Grousers) -> Scalar:
+    """The volume that grousers carry to behind the wheel per length of travel (m^2)."""
     return jnp.asarray(grousers.spin * wheel.width * grousers.height * grousers.fill)
 
 
-def extent(tool: Blade | Wheel) -> jax.Array:
-    """How high or low the tool can bring sand (m), in order of magnitude; sets the precision of a push."""
+def extent(tool: Blade | Wheel) -> Scalar:
+    """The order of magnitude of the heights (m) that the tool can make, up or down; sets the precision of a push."""
     return jnp.asarray(tool.radius) if isinstance(tool, Wheel) else jnp.abs(jnp.asarray(tool.depth))
 
 
-def reach(tool: Blade | Wheel) -> jax.Array:
-    """How far from its centre the tool reaches along its way (m), at most."""
+def reach(tool: Blade | Wheel) -> Scalar:
+    """The largest distance (m) from the tool's centre to its front, along the direction of travel."""
     if isinstance(tool, Wheel):
         return jnp.hypot(tool.radius, jnp.asarray(tool.width) / 2)
     return jnp.asarray(tool.thickness) / 2
@@ -107,27 +157,40 @@ def reach(tool: Blade | Wheel) -> jax.Array:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Pose:
-    """Where a tool stands: its centre (m) and the unit vector (cos, sin) of its heading."""
+    """Where a tool stands and which way it heads.
 
-    x: jax.Array
-    y: jax.Array
-    cos: jax.Array
-    sin: jax.Array
+    Attributes:
+        x, y: the tool's centre (m), scalars.
+        cos, sin: the unit vector of its heading, scalars; (1, 0) is +x, the direction of growing column numbers.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+        >>> pose = js.step(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04])).pose
+        >>> print(f"{pose.x:.2f} {pose.y:.2f} {pose.cos:.2f} {pose.sin:.2f}")
+        0.06 0.04 1.00 0.00
+    """
+
+    x: Float[Array, "*batch"]
+    y: Float[Array, "*batch"]
+    cos: Float[Array, "*batch"]
+    sin: Float[Array, "*batch"]
 
 
-def local(pose: Pose, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Coordinates in the tool's frame (m): along its heading and across it, to the left."""
+def local(pose: Pose, x: Float[Array, "..."], y: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """The coordinates of points (x, y) in the tool's frame (m): along its heading, and across it to the left."""
     px, py = x - pose.x, y - pose.y
     return px * pose.cos + py * pose.sin, py * pose.cos - px * pose.sin
 
 
 def coverage(
-    blade: Blade, pose: Pose, x: jax.Array, y: jax.Array, spacing: jax.Array, ahead: jax.Array | float = 0.0
-) -> jax.Array:
-    """The share of each cell, 0 to 1, that the blade covers while it moves `ahead` (m) from `pose`.
+    blade: Blade, pose: Pose, x: Float[Array, "1 W"], y: Float[Array, "H 1"], spacing: Scalar, ahead: Number = 0.0
+) -> Float[Array, "H W"]:
+    """The blade's footprint: the share of each cell, 0 to 1, that it covers while it moves ahead by `ahead` (m) from `pose`.
 
-    The product of two intervals, along and across, each smoothed over one spacing; exact for headings along the grid, a
-    first-order approximation otherwise. Continuous and piecewise linear in pose, width, thickness and `ahead`.
+    It is the product of two intervals, along and across, each smoothed over one spacing: exact for headings along the grid,
+    a first-order approximation otherwise. Continuous and piecewise linear in pose, width, thickness and `ahead`.
     """
     along, across = local(pose, x, y)
     half = jnp.asarray(blade.thickness) / 2
@@ -135,22 +198,27 @@ def coverage(
     return interval(along, -half, half + ahead, spacing) * interval(across, -side, side, spacing)
 
 
-def interval(s: jax.Array, start: jax.Array, stop: jax.Array, spacing: jax.Array) -> jax.Array:
-    """The share of [s - dx/2, s + dx/2] that lies in [start, stop]."""
+def interval(s: Float[Array, "..."], start: Scalar, stop: Scalar, spacing: Scalar) -> Float[Array, "..."]:
+    """The share of [s - dx/2, s + dx/2] that lies in [start, stop], dx the spacing."""
     return jnp.clip((s - start) / spacing + 0.5, 0.0, 1.0) - jnp.clip((s - stop) / spacing + 0.5, 0.0, 1.0)
 
 
-def wheel_frame(wheel: Wheel, pose: Pose, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Coordinates in the wheel's frame (m): along its plane and along its axle, to the left."""
+def wheel_frame(
+    wheel: Wheel, pose: Pose, x: Float[Array, "..."], y: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """The coordinates of points (x, y) in the wheel's frame (m): along its plane, and along its axle to the left."""
     along, across = local(pose, x, y)
     cos, sin = jnp.cos(wheel.slip_angle), jnp.sin(wheel.slip_angle)
     return along * cos - across * sin, along * sin + across * cos
 
 
-def rim(wheel: Wheel, pose: Pose, x: jax.Array, y: jax.Array, spacing: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The share of each cell, 0 to 1, that the wheel stands or hangs over, and the height of its rim there (m).
+def rim(
+    wheel: Wheel, pose: Pose, x: Float[Array, "1 W"], y: Float[Array, "H 1"], spacing: Scalar
+) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
+    """The wheel's footprint, the share of each cell below the wheel, 0 to 1, and the height of its rim over the cell (m).
 
-    The rim's lower half, -sinkage + r - sqrt(r^2 - a^2) at the distance a from the axle; coverage as for a blade.
+    The lower half of the rim stands at -sinkage + r - sqrt(r^2 - a^2) at the distance a from the axle along the wheel's
+    plane. The footprint is smoothed as that of `coverage`.
     """
     a, c = wheel_frame(wheel, pose, x, y)
     r, side = jnp.asarray(wheel.radius), jnp.asarray(wheel.width) / 2

@@ -1,4 +1,4 @@
-"""Where the sand moves: a part of the map that alone is computed."""
+"""Windows: the part of the map that is computed, where sand moves."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,49 +6,70 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class AsNeeded:
-    """Where a blade's sand moves, as far as the blade's size tells (the default).
+    """The simulator chooses a window from the blade's size, and enlarges it as needed; the default of `make_scene`.
 
-    A stepped push of a blade computes a window around it, and a larger one, up to the whole map, where sand reaches its
-    edge. Inside of `jit`, `grad` or `vmap`, where what happens is not known beforehand, the window is half as wide again,
-    and the outcome says WINDOW_EDGE if it was too small; give `Window(size)` or `Whole()` then. All else is computed
-    everywhere.
+    A `SteppedPush` of a `Blade` computes only a window around the blade. If sand reaches the window's edge, the push is
+    computed again in a window twice as wide, and in the end on the whole map. Inside `jit`, `grad` and `vmap`, where no
+    second try is possible, the window is half as wide again to begin with, and the outcome says WINDOW_EDGE if it was too
+    small: give `Window(size)` or `Whole()` then. Every other computation uses the whole map.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.make_scene((8, 8), 0.01).window
+        AsNeeded()
     """
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Whole:
-    """Everywhere."""
+    """The whole map is computed.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.make_scene((8, 8), 0.01, window=js.Whole()).window
+        Whole()
+    """
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Window:
-    """In a block of `size` cells (rows, columns): as part of a scene one that follows the tool, given to `settle` one around
-    what is too steep (see there).
+    """Only a block of the map is computed: in a scene, one that follows the tool; in `settle`, one around what is too steep.
 
-    Under a tool the map must be still when the tool comes down: no slope above repose by more than `tolerance`. If that does
-    not hold, or an outermost cell of the block (where its edge is not the map's) moves by more than `tolerance` spacings
-    while the tool advances by a spacing, the outcome says WINDOW_EDGE: the result may then differ from that of `Whole`.
-    With tolerance 0 and no such outcome the two are equal up to the rounding of single operations.
+    The map outside the block must be still: before the tool comes down, no slope may exceed repose by more than
+    `tolerance`. The outcome says WINDOW_EDGE if one does, or if an outermost cell of the block (where the block's edge is
+    not the map's) moves by more than `tolerance` spacings while the tool advances by one spacing. The result may then
+    differ from that of `Whole`. With tolerance 0 and no such outcome, both are equal up to rounding.
+
+    Attributes:
+        size: rows and columns of the block, at most those of the map; static.
+        tolerance: slope above repose, and movement in spacings, that count as still.
+        near: number of cells across the part of the block that the tool can touch, or None; static. The simulator sets it.
+
+    Example:
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((64, 64), 0.01, tool=js.Blade(), window=js.Window((24, 24)))
+        >>> scene.window.size
+        (24, 24)
     """
 
     size: tuple[int, int] = field(metadata={"static": True})
-    tolerance: jax.Array | float = 1e-3
+    tolerance: Float[Array, ""] | float = 1e-3
     near: int | None = field(default=None, metadata={"static": True})
-    """How many cells across all lies that the tool covers or touches; the simulator looks where the tool's size is known."""
 
 
-Origin = list[jax.Array]
+Origin = list[Int[Array, ""]]
 
 
-def origin(window: Window, shape: tuple[int, int], centre: tuple[jax.Array, jax.Array]) -> Origin:
-    """First row and column of the block around `centre` (row, column), moved to lie on the map."""
+def origin(window: Window, shape: tuple[int, int], centre: tuple[Float[Array, ""], Float[Array, ""]]) -> Origin:
+    """The first row and column of the block around `centre` (row, column), shifted so that the block lies on the map."""
     return [
         jnp.clip(jnp.floor(c).astype(jnp.int32) - n // 2, 0, m - n)
         for c, n, m in zip(centre, window.size, shape, strict=True)
@@ -56,7 +77,7 @@ def origin(window: Window, shape: tuple[int, int], centre: tuple[jax.Array, jax.
 
 
 def cut(window: Window, shape: tuple[int, int], start: Origin, tree: Any) -> Any:
-    """The block of every map in a tree: [H, W], [1, W], [H, 1], or with a halo [H + 2, W + 2]. Scalars stay."""
+    """The block of every map in a tree: of [H, W], [1, W], [H, 1], or with ghost cells [H + 2, W + 2]. Scalars stay."""
 
     def one(a: jax.Array) -> jax.Array:
         if a.ndim < 2:
@@ -69,12 +90,12 @@ def cut(window: Window, shape: tuple[int, int], start: Origin, tree: Any) -> Any
 
 
 def paste(start: Origin, tree: Any, blocks: Any) -> Any:
-    """The maps of a tree with their blocks replaced."""
+    """The tree with the block of each of its maps replaced by the one in `blocks`."""
     return jax.tree.map(lambda a, b: lax.dynamic_update_slice(a, b, start), tree, blocks)
 
 
-def near_edge(window: Window, shape: tuple[int, int], start: Origin) -> jax.Array:
-    """Which cells of the block lie within two cells of its edge where that is not the map's."""
+def near_edge(window: Window, shape: tuple[int, int], start: Origin) -> Bool[Array, "h w"]:
+    """Which cells of the block lie within two cells of those of its edges that are not the map's."""
     near = []
     for o, n, m in zip(start, window.size, shape, strict=True):
         i = jnp.arange(n)
@@ -83,10 +104,14 @@ def near_edge(window: Window, shape: tuple[int, int], start: Origin) -> jax.Arra
 
 
 def edge_movement(
-    window: Window, shape: tuple[int, int], start: Origin, old: jax.Array, new: jax.Array, cover: jax.Array
-) -> jax.Array:
-    """The largest change of height within two cells of the block's edge where that is not the map's; infinite if the tool
-    covers a part of it."""
+    window: Window,
+    shape: tuple[int, int],
+    start: Origin,
+    old: Float[Array, "h w"],
+    new: Float[Array, "h w"],
+    cover: Float[Array, "h w"],
+) -> Float[Array, ""]:
+    """The largest change of height (m) in the cells of `near_edge`; infinite if the tool covers one of them."""
     change = jnp.where(new == old, 0, jnp.abs(new - old))
     change = jnp.where(jnp.isnan(new), 0, jnp.where(cover > 0, jnp.inf, change))
     return lax.stop_gradient(jnp.max(jnp.where(near_edge(window, shape, start), change, 0)))

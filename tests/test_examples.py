@@ -1,0 +1,52 @@
+"""The examples in the docstrings of public names give what they say."""
+
+import doctest
+import inspect
+from collections.abc import Iterator
+
+import jax
+import pytest
+
+import jaxsand as js
+
+NAMES = sorted(name for name in js.__all__ if inspect.isroutine(getattr(js, name)) or inspect.isclass(getattr(js, name)))
+
+
+@pytest.fixture(autouse=True)
+def _as_users_run_them() -> Iterator[None]:
+    """In float32; and without most of XLA's optimisations, which would take longer than the examples."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    with jax.enable_x64(False):
+        yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def run(name: str, obj: object) -> tuple[int, str]:
+    """The number of examples in a docstring, and a report of those that fail."""
+    report: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    tests = doctest.DocTestFinder().find(obj, name, globs={})
+    for test in tests:
+        runner.run(test, out=report.append)
+    return sum(len(test.examples) for test in tests), "".join(report)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_example_runs(name):
+    examples, report = run(name, getattr(js, name))
+    assert examples, f"{name} has no example"
+    assert not report, report
+
+
+def test_a_wrong_example_is_found():
+    def wrong():
+        """One and one.
+
+        Example:
+            >>> 1 + 1
+            3
+        """
+
+    examples, report = run("wrong", wrong)
+    assert examples == 1
+    assert "Got:\n    2" in report
