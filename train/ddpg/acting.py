@@ -12,7 +12,8 @@ import optax
 from jaxsand.bench.stroke_goals import CELLS
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.scene.scene import Scene, blade_of
-from train.ddpg.networks import Actor, Critic, Observation
+from train.ddpg.networks import Actor, Critic
+from train.replay.her import Observation
 
 _TRIED = 16  # actions for each one that is asked for
 _SEED = 0  # of how they differ from the actor's, the same at every look

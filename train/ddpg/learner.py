@@ -22,10 +22,10 @@ import optax
 
 from jaxsand.envs.multi import StrokeParams
 from train.ddpg.acting import Acts
-from train.ddpg.networks import Actor, Critic, Flat, Maps, Observation, Sight
+from train.ddpg.networks import Actor, Critic, Flat, Maps, Sight
 from train.ddpg.tasks import Strokes, Task
 from train.replay.buffer import Buffer
-from train.replay.her import Future, Steps, Strategy, mixed
+from train.replay.her import Future, Observation, Steps, Strategy, mixed
 
 _REMEMBERED = jnp.float16  # observations: maps in units of the blade's depth
 

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-Observation = jax.Array | dict[str, jax.Array]
-"""A vector [B, N], or a dictionary of maps [B, H, W], one of them the "goal" and one "current"."""
+from train.replay.her import Observation
 
 _SMALL = nn.initializers.variance_scaling(1e-3, "fan_in", "uniform")  # of last layers: actions and values begin near 0
 

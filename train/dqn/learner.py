@@ -21,13 +21,12 @@ import jax.numpy as jnp
 import optax
 
 from jaxsand.envs.onmap import MapParams, MapState
-from train.ddpg.networks import Observation
 from train.dqn.networks import Bins, Greedy, Head, Mean, QNet
 from train.dqn.targets import Backup, Every, Items, Sampled, items_of
 from train.dqn.tasks import SingleStroke, Task
 from train.evaluation.probes import ProbeState
 from train.replay.buffer import Buffer
-from train.replay.her import Final, Steps, Strategy, chosen, relabel
+from train.replay.her import Final, Observation, Steps, Strategy, chosen, relabel
 
 Learned = tuple[optax.Params, optax.Params, optax.OptState]
 """A network's parameters, their moving average, and the optimiser's state."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from train.ddpg.networks import Observation
+from train.replay.her import Observation
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand.envs.onmap import MapParams
-from train.ddpg.networks import Observation
 from train.dqn.networks import best, of
 from train.dqn.tasks import Task
-from train.replay.her import Steps, last_steps
+from train.replay.her import Observation, Steps, last_steps
 
 Values = Callable[[Observation], jax.Array]
 """Observations [B, ...] to the values of their actions [B, A]."""

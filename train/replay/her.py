@@ -11,6 +11,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+Observation = jax.Array | dict[str, jax.Array]
+"""A vector [B, N], or a dictionary of maps [B, H, W], one of them the "goal" and one "current"."""
+
 Judge = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 """From what there was before a step, what there is after it, and the goal, the reward and whether the episode terminates."""
 
