@@ -2,7 +2,8 @@
 
 A vmapped push takes as long as the longest of its strokes. `ByLength` therefore tells vmap to sort a batch by the strokes'
 lengths and to push chunk after chunk of like ones, each small enough for a core's cache. A map comes out as it would alone,
-up to rounding. On several cores of a CPU, give each a device of its own and a share of the batch (see the README).
+up to rounding. On several cores of a CPU, give each a device of its own and a share of the batch (see the
+site's guide to batches).
 
 A rule for vmap has no derivative of its own. What follows is how a push gets one that is batched in the same way: tangents
 and cotangents are sorted and taken chunk after chunk like the maps. The derivative is that of the push alone, in both modes
