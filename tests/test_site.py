@@ -1,6 +1,7 @@
 """The README and the site do what they say: links lead somewhere, code runs, commands are understood, nothing is left out."""
 
 import importlib.util
+import inspect
 import json
 import re
 import shlex
@@ -127,6 +128,17 @@ def test_every_public_name_is_in_the_reference(hooks):
     assert sorted(re.findall(r"^::: jaxsand\.(\w+)$", pages, re.MULTILINE)) == sorted(
         [*jaxsand.__all__, "envs"]
     )  # envs: the room as a whole
+
+
+def test_documented_arguments_are_those_of_the_function():
+    for name in jaxsand.__all__:
+        function = getattr(jaxsand, name)
+        if inspect.isfunction(function):
+            section = re.search(r"^Args:\n((?:  .*\n|\n)*)", f"{inspect.getdoc(function)}\n", re.MULTILINE)
+            indent = re.match(r" *", section[1])[0] if section else ""
+            told = re.findall(rf"^{indent}(\w+(?:, \w+)*): ", section[1] if section else "", re.MULTILINE)
+            unknown = set(", ".join(told).split(", ")) - {"", *inspect.signature(function).parameters}
+            assert not unknown, f"{name}: {unknown}"
 
 
 def test_a_report_becomes_tables(hooks):
