@@ -154,10 +154,14 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 def on_page_content(content: str, page: Any, config: Any, files: Any) -> str:
     """Formulas become MathML, which browsers draw by themselves."""
     from latex2mathml.converter import convert
+    from mkdocs.exceptions import PluginError
 
     def drawn(found: re.Match[str]) -> str:
         display = "block" if found[1] == "div" else "inline"
-        return convert(html.unescape(found[2]).strip(), display=display)
+        formula = convert(html.unescape(found[2]).strip(), display=display)
+        if "\\" in formula:
+            raise PluginError(f"{page.file.src_uri}: {found[2]!r} holds a command of TeX that does not become MathML")
+        return formula
 
     return re.sub(r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', drawn, content, flags=re.DOTALL)
 
