@@ -158,7 +158,17 @@ def test_rooms_import_downwards_in_the_drawing(hooks):
     assert all(f">{room}</text>" in drawing for room in ("cli", "scene", "autodiff"))
 
 
-def test_the_readme_is_short():
+def test_files_that_are_named_exist():
+    named_files = 0
+    for path in [README, *PAGES]:
+        for name in re.findall(r"`((?:\w+/)+\w+\.(?:py|yml|npz))`", path.read_text(encoding="utf-8")):
+            assert (ROOT / name).exists() or (ROOT / "jaxsand" / name).exists(), f"{named(path)}: {name} is not there"
+            named_files += 1
+    assert named_files > 30
+
+
+def test_the_readme_is_short_and_has_code():
+    assert blocks(README, "python")
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
 
 
