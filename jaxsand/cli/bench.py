@@ -1,7 +1,10 @@
 """`jaxsand bench`: error against run time, and speed beside rivals."""
 
 import argparse
+import subprocess
 from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from jaxsand.cli.files import folder, progress, write_json, written
@@ -16,7 +19,8 @@ def run_benchmark(options: argparse.Namespace) -> None:
     from jaxsand.bench.report import bench, table
 
     strokes = _of_strokes(options)
-    report = bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
+    origin = {"command": options.command_line, "commit": _commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+    report = origin | bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
     if out:
         from jaxsand.viz.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
 
@@ -48,8 +52,19 @@ def run_benchmark(options: argparse.Namespace) -> None:
     show(options, report, table)
 
 
+def _commit() -> str | None:
+    """The commit of the checkout that this code runs from, with "-dirty" where files were changed; None if installed."""
+    here = Path(__file__)
+    for command in (["ls-files", "--error-unmatch", here.name], ["describe", "--always", "--dirty"]):
+        try:
+            done = subprocess.run(["git", *command], cwd=here.parent, capture_output=True, text=True, check=True)
+        except (OSError, subprocess.CalledProcessError):
+            return None
+    return done.stdout.strip()
+
+
 def _device_for_each_core() -> None:
-    """As the README has it for batches of environments; too late once JAX has begun to compute."""
+    """As the site has it for batches of environments; too late once JAX has begun to compute."""
     import jax
 
     from jaxsand.relaxation.batching import processors

@@ -5,6 +5,8 @@ wrong; what to do`. Arguments are read before JAX is imported, so that --help an
 """
 
 import argparse
+import shlex
+import sys
 from typing import Any
 
 from jaxsand.cli import SCHEMES, run_benchmark, run_plan, run_settle, run_shape, run_trench
@@ -25,6 +27,7 @@ from jaxsand.cli.arguments import (
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns its exit code. Mistakes in the arguments themselves raise SystemExit(2)."""
     options = _parser().parse_args(arguments)
+    options.command_line = shlex.join(["jaxsand", *(sys.argv[1:] if arguments is None else arguments)])
     draw_without_a_screen()
     if options.run is not run_benchmark:  # which tells compile time apart
         keep_compiled_programs()

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
@@ -176,7 +177,7 @@ def fit(scene: Scene, height: Float[ArrayLike, "H W"]) -> tuple[Scene, Float[Arr
     return cast(scene, height.dtype), height
 
 
-def as_array(name: str, value: ArrayLike, dtype: DTypeLike | None = None) -> jax.Array:
+def as_array(name: str, value: ArrayLike | npt.ArrayLike, dtype: DTypeLike | None = None) -> jax.Array:
     """The value as an array; raises a ValueError that bears the name if it is none."""
     try:
         return jnp.asarray(value, dtype)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import pytest
 
@@ -53,6 +54,9 @@ def test_the_command_prints_them(report, monkeypatch, capsys, tmp_path):
     assert main(["bench", "grad", "--json", "--out", str(tmp_path)]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert set(report) < set(printed)
+    assert printed["command"] == f"jaxsand bench grad --json --out {tmp_path}"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", printed["date"])
+    assert printed["commit"] is None or re.fullmatch(r"[0-9a-f]{7,}(-dirty)?", printed["commit"])
     assert (tmp_path / "bench-grad.json").is_file()
     assert main(["bench", "grad", "--batch", "1024"]) == 0
     assert larger == [None, 1024]
