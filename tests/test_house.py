@@ -9,7 +9,7 @@ PACKAGE = Path(jaxsand.__file__).parent
 
 HEAVY = {
     "matplotlib": {"viz.render", "viz.trenches", "viz.strokes", "goals.surfaces"},
-    "PIL": {"viz.render", "goals.surfaces"},
+    "PIL": {"viz.render", "goals.letters"},
 }
 
 
