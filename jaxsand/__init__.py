@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jaxsand.interaction.batched import step_batch as step_batch
     from jaxsand.interaction.batched import value_and_grad_batch as value_and_grad_batch
     from jaxsand.interaction.blade_closed_form import SwathPush as SwathPush
-    from jaxsand.interaction.blade_stepped import SteppedPush as SteppedPush
+    from jaxsand.interaction.rule import PushRule as PushRule
     from jaxsand.interaction.simulate import OutcomeError as OutcomeError
     from jaxsand.interaction.simulate import Shaped as Shaped
     from jaxsand.interaction.simulate import act as act
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from jaxsand.interaction.simulate import follow_frames as follow_frames
     from jaxsand.interaction.simulate import rollout as rollout
     from jaxsand.interaction.simulate import step as step
+    from jaxsand.interaction.stepped import SteppedPush as SteppedPush
     from jaxsand.interaction.wheel_closed_form import SplitPush as SplitPush
     from jaxsand.planning.binary import Plan as Plan
     from jaxsand.planning.binary import plan as plan
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
     from jaxsand.scene.tools import NoTool as NoTool
     from jaxsand.scene.tools import Pose as Pose
     from jaxsand.scene.tools import Smooth as Smooth
+    from jaxsand.scene.tools import Tool as Tool
     from jaxsand.scene.tools import Wheel as Wheel
     from jaxsand.scene.window import AsNeeded as AsNeeded
     from jaxsand.scene.window import Whole as Whole
@@ -96,6 +98,7 @@ _HOMES = {
     "Plan": "planning.binary",
     "Pose": "scene.tools",
     "Pushed": "interaction._path",
+    "PushRule": "interaction.rule",
     "Relaxation": "relaxation.schemes",
     "SandPlan": "planning.search",
     "Scene": "scene.scene",
@@ -104,11 +107,12 @@ _HOMES = {
     "Shaped": "interaction.simulate",
     "Smooth": "scene.tools",
     "SplitPush": "interaction.wheel_closed_form",
-    "SteppedPush": "interaction.blade_stepped",
+    "SteppedPush": "interaction.stepped",
     "Steps": "planning.search.actions",
     "SuperTimeStepping": "relaxation.schemes",
     "SwathPush": "interaction.blade_closed_form",
     "Sweeps": "relaxation.stopping",
+    "Tool": "scene.tools",
     "Trial": "terramechanics.calibration",
     "TwoGrids": "terramechanics.finer",
     "UntilStill": "relaxation.stopping",

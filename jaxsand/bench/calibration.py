@@ -9,7 +9,8 @@ import numpy as np
 
 from jaxsand.bench.timing import seconds_of
 from jaxsand.interaction.blade_closed_form import SwathPush
-from jaxsand.interaction.simulate import Push, step
+from jaxsand.interaction.rule import PushRule
+from jaxsand.interaction.simulate import step
 from jaxsand.relaxation.settling import settle
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.progress import Tell, quiet
@@ -132,7 +133,7 @@ def _found(true: Scene, guess: Scene, before: np.ndarray, seed: int) -> tuple[fl
     return math.degrees(found.values["repose_angle"]), math.degrees(found.noise_errors["repose_angle"])
 
 
-def _after(scene: Scene, before: np.ndarray, stroke: np.ndarray | None, push: Push | None) -> Any:
+def _after(scene: Scene, before: np.ndarray, stroke: np.ndarray | None, push: PushRule | None) -> Any:
     return settle(scene, before).height if stroke is None else step(scene, before, stroke, push=push).height
 
 

@@ -23,7 +23,7 @@ from jaxsand.bench.gradient_checks import (
     sloped,
 )
 from jaxsand.bench.timing import race
-from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
 from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
 from jaxsand.scene.progress import Tell, quiet

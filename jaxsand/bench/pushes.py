@@ -22,10 +22,11 @@ from jaxsand.bench.timing import race
 from jaxsand.goals.surfaces import rough_surface
 from jaxsand.interaction.batched import act_batch, step_batch, value_and_grad_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
-from jaxsand.interaction.blade_stepped import SteppedPush, push_along, with_near
+from jaxsand.interaction.blade_stepped import push_along, with_near
 from jaxsand.interaction.resting import Sand, no_flux
 from jaxsand.interaction.simulate import follow, follow_frames, step
 from jaxsand.interaction.stencil import net, steps
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import truncate
 from jaxsand.relaxation.settling import settle, settle_batch

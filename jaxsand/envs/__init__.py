@@ -26,7 +26,8 @@ from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.envs.onsand import OnSand, SandParams, SandState
 from jaxsand.envs.pushing import ByLength, Together
 from jaxsand.envs.spaces import Box, Dict, Discrete
-from jaxsand.interaction.blade_stepped import SteppedPush, with_near
+from jaxsand.interaction.blade_stepped import with_near
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade

@@ -11,7 +11,8 @@ from jaxsand.envs.onmap import OnMap
 from jaxsand.envs.onsand import OnSand
 from jaxsand.envs.pushing import Batching, Push
 from jaxsand.relaxation.stopping import Stop as StopRule
-from jaxsand.scene.scene import Scene, blade_of, concrete
+from jaxsand.scene.scene import Scene, blade_of
+from jaxsand.scene.validation import concrete
 
 _KINDS: dict[str, Any] = {
     "on": OnMap | OnSand,

@@ -11,7 +11,7 @@ from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.pushing import Batching, ByLength, Push
 from jaxsand.envs.spaces import Box, Dict
 from jaxsand.goals import metrics as task
-from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of
 

@@ -11,8 +11,8 @@ from jaxsand.envs.maps import MapGoals, Walks
 from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.envs.spaces import Box, Dict, Discrete
 from jaxsand.goals import metrics as task
-from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import act
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.pipeline import Layout
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Pose, coverage

@@ -24,8 +24,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxsand.autodiff.while_loop import first_order, split
 from jaxsand.interaction.blade_closed_form import SwathPush
-from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import step
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop, check_whole
 from jaxsand.scene.scene import Scene, cast
 

@@ -28,7 +28,7 @@ from jaxsand.relaxation.stopping import Outcome, said
 from jaxsand.relaxation.sweep import Flow
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import NoTool, Pose, extent, local, lowest, reach
+from jaxsand.scene.tools import Blade, NoTool, Pose, Wheel, extent, local, lowest, reach
 from jaxsand.scene.tools import usable as makes_sense
 from jaxsand.scene.window import Window
 
@@ -60,6 +60,7 @@ class Pushed:
 
 
 State = tuple[jax.Array, Lost, jax.Array]  # height, height lost over the rim, movement at the window's edge
+Record = Callable[[jax.Array], Any]  # what to keep of a map after each leg
 Leg = Callable[[Job, Pose, jax.Array, Pose | None, State], State]
 
 
@@ -69,7 +70,7 @@ def along_legs(
     path: jax.Array,
     rate: jax.Array | float,
     leg: Leg,
-    record: Callable[[jax.Array], Any] | None = None,
+    record: Record | None = None,
 ) -> tuple[Pushed, Any]:
     """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it.
 
@@ -87,6 +88,8 @@ def along_legs(
         legs = path.shape[0] - 1
         frames = jax.tree.map(lambda f: jnp.broadcast_to(f, (legs, *f.shape)), record(height)) if record else ()
         return Pushed(height, _outcome(jnp.zeros((), bool), ~usable), jnp.zeros_like(path[0, 0]), still), frames
+    if not isinstance(scene.tool, Blade | Wheel):
+        raise TypeError(f"scene.tool: got {type(scene.tool).__name__}; legs are of a Blade or a Wheel")
     bed = prepare(scene)
     intact, broken = mark(scene, height)
     # Of a path or a tool that is not usable nothing is used; the blade hangs above everything.

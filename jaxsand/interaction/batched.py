@@ -17,8 +17,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import Pushed
-from jaxsand.interaction.blade_stepped import windows_for
-from jaxsand.interaction.simulate import Push, Rules, Shaped, lifted, ready, step, way_of
+from jaxsand.interaction.rule import PushRule
+from jaxsand.interaction.simulate import Rules, Shaped, lifted, ready, step, windows_for
 from jaxsand.relaxation.batching import in_groups, in_turns, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
@@ -35,7 +35,7 @@ def step_batch(
     height: Float[ArrayLike, "B H W"],
     stroke: Float[ArrayLike, "B 4"],
     *,
-    push: Push | None = None,
+    push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     chunk: int | None = None,
@@ -77,7 +77,7 @@ def act_batch(
     height: Float[ArrayLike, "B H W"],
     stroke: Float[ArrayLike, "B 4"],
     *,
-    push: Push | None = None,
+    push: PushRule | None = None,
     chunk: int | None = None,
 ) -> Pushed:
     """`act` for a batch of maps [B, H, W] (m) and strokes [B, 4] (m) of one scene, called like `step_batch`."""
@@ -90,7 +90,7 @@ def value_and_grad_batch(
     height: Float[ArrayLike, "B H W"],
     stroke: Float[ArrayLike, "B 4"],
     *args: Any,
-    push: Push | None = None,
+    push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     chunk: int | None = None,
@@ -194,8 +194,8 @@ def _act_program() -> Any:
     return jax.jit(run, compiler_options=wide_vectors())
 
 
-def _acted(scene: Scene, push: Push, batch: Any) -> Pushed:
-    return jax.vmap(lambda h, s: way_of(scene, push)(scene, h, s.reshape(2, 2), push)[0])(*batch[:2])
+def _acted(scene: Scene, push: PushRule, batch: Any) -> Pushed:
+    return jax.vmap(lambda h, s: push.along(scene, h, s.reshape(2, 2))[0])(*batch[:2])
 
 
 @cache

@@ -19,7 +19,6 @@ that volume is kept as well as floats allow.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,13 +31,14 @@ from jaxtyping import Array, Float
 from jaxsand.interaction._displacement import Job, contact, settle_around, take, whole
 from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
 from jaxsand.interaction._overflow import Rim, nothing_beyond
-from jaxsand.interaction._path import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._shade import on_line, within_reach
 from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
 from jaxsand.relaxation.ghost_cells import Lost, lose
+from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Pose, coverage, local
+from jaxsand.scene.tools import Blade, NoTool, Pose, coverage, local
 from jaxsand.scene.window import Whole
 
 # Shapes, fitted to SteppedPush.fine() with blades of 2 to 16 cells; lengths are shares of the reach r, or cells.
@@ -94,9 +94,22 @@ class SwathPush:
     sweeps: int = field(default=8, metadata={"static": True})
     rate: Float[Array, ""] | float = 0.125
 
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError if the scene's tool is no blade, or a number is out of range; see `PushRule`."""
+        if not isinstance(scene.tool, NoTool | Blade):
+            raise ValueError(
+                f"push: got SwathPush for a {type(scene.tool).__name__}; SwathPush() is for a Blade, SteppedPush() for both"
+            )
+        check_whole("push.sweeps", self.sweeps, 0)
+        check_rate(scene, "push.rate", self.rate)
+
+    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Any]:
+        """Moves the scene's blade along the path; see `PushRule`."""
+        return push_swath(scene, height, path, self, record)
+
 
 def push_swath(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SwathPush, record: Callable[[jax.Array], Any] | None = None
+    scene: Scene, height: jax.Array, path: jax.Array, push: SwathPush, record: Record | None = None
 ) -> tuple[Pushed, Any]:
     """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
     scene = replace(scene, window=Whole())

@@ -12,70 +12,38 @@ stroke.
 """
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import repeat, repeat_until
 from jaxsand.interaction._advance import Advance, Rest
 from jaxsand.interaction._block import SPARE, Block, Moving, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._lowering import Lower
-from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, over_the_map, turn_between
 from jaxsand.interaction._turning import Turn
 from jaxsand.interaction.resting import bring_to_rest, no_flux
-from jaxsand.scene.scene import Scene, concrete
+from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, Pose
+from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import AsNeeded, Window
 
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class SteppedPush:
-    """The tool advances by small sub-steps, and the sand around it is brought to rest after each: the default push.
-
-    It approximates the quasi-static limit, in which the tool moves so slowly that the sand around it is always at rest, for
-    a `Blade` or a `Wheel`. In each sub-step the sand in the newly covered part of cells moves one cell on along the
-    normal of the tool's face; then `sweeps` proximal gradient steps bring the sand around the tool to repose. The map
-    converges to the limit as `substep` and 1 / `sweeps` go to 0; `jaxsand bench push` measures the error and the cost. The
-    last, shorter sub-step of a leg counts in proportion to its length, so that the result is continuous in the stroke.
-
-    Attributes:
-        substep: length of a sub-step in spacings, above 0 and at most 1; static.
-        sweeps: number of proximal steps after each sub-step; static.
-        rate: step length of these, as the rate of `Relaxation`.
-
-    Source:
-        Kim, Pavlov & Johnson, arXiv:1908.02745, section "Tool Interaction", with shares of cells in place of whole cells.
-
-    Example:
-        >>> import jaxsand as js
-        >>> js.SteppedPush.fine()
-        SteppedPush(substep=0.0625, sweeps=8, rate=0.2)
-    """
-
-    substep: float = field(default=0.125, metadata={"static": True})
-    sweeps: int = field(default=4, metadata={"static": True})
-    rate: Float[Array, ""] | float = 0.2
-
-    @classmethod
-    def fine(cls) -> "SteppedPush":
-        """A push with half the sub-step and twice the sweeps: closer to the limit, at about three times the cost."""
-        return cls(1 / 16, 8)
+if TYPE_CHECKING:
+    from jaxsand.interaction.stepped import SteppedPush
 
 
 def push_along(
     scene: Scene,
     height: jax.Array,
     path: jax.Array,
-    push: SteppedPush,
-    record: Callable[[jax.Array], Any] | None = None,
+    push: "SteppedPush",
+    record: Record | None = None,
     rest: Rest = bring_to_rest,
 ) -> tuple[Pushed, Any]:
     """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`.
@@ -91,7 +59,7 @@ def push_along(
 
 def _leg(
     scene: Scene,
-    push: SteppedPush,
+    push: "SteppedPush",
     rest: Rest,
     job: Job,
     pose: Pose,
@@ -184,12 +152,12 @@ _TOLERANCE = 1e-3  # as settling leaves it by default: slopes above repose, and 
 _LEAST = 1.5  # times a window's width: the map's, for the window to save work
 
 
-def windows_for(scene: Scene, push: Any, times: float = 1) -> Iterator[Scene]:
+def windows_for(scene: Scene, times: float = 1) -> Iterator[Scene]:
     """The scene with windows around its blade, each twice as wide as the one before, as long as that saves work.
 
     The first is `times` as wide as the blade and the heap that it pushes. The next is for sand that reaches its edge.
     """
-    if not (isinstance(scene.window, AsNeeded) and isinstance(scene.tool, Blade) and isinstance(push, SteppedPush)):
+    if not (isinstance(scene.window, AsNeeded) and isinstance(scene.tool, Blade)):
         return
     known = _known(scene.tool.width, scene.tool.thickness, scene.tool.depth, scene.grid.spacing)
     angle = concrete(scene.material.repose_angle)

@@ -1,7 +1,7 @@
 """The simulator: a tool moves through the sand, then the sand settles."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -12,30 +12,18 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import Pushed
-from jaxsand.interaction.blade_closed_form import SwathPush, push_swath
-from jaxsand.interaction.blade_stepped import SteppedPush, push_along, windows_for, with_near
-from jaxsand.interaction.wheel_closed_form import SplitPush, push_split
-from jaxsand.interaction.wheel_stepped import roll_along
+from jaxsand.interaction.blade_stepped import with_near
+from jaxsand.interaction.rule import PushRule
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Multilevel, Scheme
 from jaxsand.relaxation.settling import Settled, relax
-from jaxsand.relaxation.stopping import Outcome, Stop, check_rate, check_rule, check_whole
-from jaxsand.scene.scene import Scene, as_array, cast, concrete, fit
-from jaxsand.scene.tools import Blade, NoTool, Pose, Wheel
+from jaxsand.relaxation.stopping import Outcome, Stop, check_rule
+from jaxsand.scene.scene import Scene, as_array, cast, fit
+from jaxsand.scene.tools import Pose
+from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
 
-Push = SteppedPush | SwathPush | SplitPush
-Rules = tuple[Push, Scheme, Stop]
-_PUSHES: dict[tuple[type, type], Any] = {
-    (Blade, SteppedPush): push_along,
-    (Blade, SwathPush): push_swath,
-    (Wheel, SteppedPush): roll_along,
-    (Wheel, SplitPush): push_split,
-    (NoTool, SteppedPush): push_along,
-    (NoTool, SwathPush): push_along,
-    (NoTool, SplitPush): push_split,
-}
-
-
+Rules = tuple[PushRule, Scheme, Stop]
 _SURE = 1.5  # times the width of a window that a stroke asks for, where there is no second try
 
 
@@ -66,7 +54,9 @@ class Shaped(Settled):
     pose: Pose
 
 
-def act(scene: Scene, height: Float[ArrayLike, "H W"], stroke: Float[ArrayLike, "4"], *, push: Push | None = None) -> Pushed:
+def act(
+    scene: Scene, height: Float[ArrayLike, "H W"], stroke: Float[ArrayLike, "4"], *, push: PushRule | None = None
+) -> Pushed:
     """One straight push without settling: the map just after the tool was lifted.
 
     Sand that was not at rest when the tool was lifted stays as it is; `step` lets it settle too. Differentiable like `step`.
@@ -75,7 +65,7 @@ def act(scene: Scene, height: Float[ArrayLike, "H W"], stroke: Float[ArrayLike, 
         scene: the scene, with the tool.
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
         stroke: start and end of the tool's centre [4] = x0, y0, x1, y1 (m).
-        push: `SteppedPush` (the default), `SwathPush` for a blade, or `SplitPush` for a wheel.
+        push: `SteppedPush` (the default), `SwathPush` for a blade, `SplitPush` for a wheel, or another `PushRule`.
 
     Returns:
         The map, the outcome, the volume that drained, and the tool's last pose.
@@ -102,7 +92,7 @@ def step(
     height: Float[ArrayLike, "H W"],
     stroke: Float[ArrayLike, "4"],
     *,
-    push: Push | None = None,
+    push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
@@ -122,7 +112,8 @@ def step(
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx. Use `jax.vmap` or
             `step_batch` for many.
         stroke: start and end of the tool's centre [4] = x0, y0, x1, y1 (m).
-        push: how the tool moves the sand: `SteppedPush` (the default), `SwathPush` for a blade, or `SplitPush` for a wheel.
+        push: how the tool moves the sand: `SteppedPush` (the default), `SwathPush` for a blade, `SplitPush` for a wheel, or
+            another `PushRule`.
         scheme: scheme of settling, as of `settle`.
         stop: stop rule of settling, as of `settle`.
 
@@ -156,7 +147,7 @@ def follow(
     height: Float[ArrayLike, "H W"],
     path: Float[ArrayLike, "n 2"],
     *,
-    push: Push | None = None,
+    push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
@@ -200,7 +191,7 @@ def follow_frames(
     height: Float[ArrayLike, "H W"],
     path: Float[ArrayLike, "n 2"],
     *,
-    push: Push | None = None,
+    push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> tuple[Shaped, Float[Array, "n-1 H W"]]:
@@ -238,7 +229,7 @@ def rollout(
     height: Float[ArrayLike, "H W"],
     strokes: Float[ArrayLike, "n 4"],
     *,
-    push: Push | None = None,
+    push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Shaped:
@@ -364,33 +355,24 @@ def check(result: Settled | Pushed) -> None:
     raise OutcomeError(where + "; ".join(advice.format(**detail) for bit, advice in _ADVICE.items() if bit in code))
 
 
-def way_of(scene: Scene, push: Push) -> Any:
-    """The function that moves the scene's tool as the push says: of a scene, a map, a path, the push and a recorder."""
-    return _PUSHES[type(scene.tool), type(push)]
+def windows_for(scene: Scene, push: PushRule, times: float = 1) -> Iterator[Scene]:
+    """The scene with windows in which the push may do, each wider than the one before; see `SteppedPush.windows`."""
+    return push.windows(scene, times) if isinstance(push, SteppedPush) else iter(())
 
 
 def check_push(push: object) -> None:
     """Raises ValueError unless it is one of the pushes."""
-    if not isinstance(push, Push):
+    if isinstance(push, type) or not isinstance(push, PushRule):
         raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
 
 
 def ready(
-    scene: Scene, height: Float[ArrayLike, "H W"], push: Push | None, scheme: Scheme | None, stop: Stop | None
+    scene: Scene, height: Float[ArrayLike, "H W"], push: PushRule | None, scheme: Scheme | None, stop: Stop | None
 ) -> tuple[Scene, Float[Array, "H W"], Rules]:
     """The checked arguments, with None replaced by defaults and every number cast to the height's dtype."""
     push = SteppedPush() if push is None else push
     check_push(push)
-    if (type(scene.tool), type(push)) not in _PUSHES:
-        other = "SwathPush() is for a Blade" if isinstance(push, SwathPush) else "SplitPush() is for a Wheel"
-        raise ValueError(
-            f"push: got {type(push).__name__} for a {type(scene.tool).__name__}; {other}, SteppedPush() for both"
-        )
-    if isinstance(push, SteppedPush) and not 0 < push.substep <= 1:
-        raise ValueError(f"push.substep: got {push.substep!r}; give a part of a spacing, above 0 and at most 1")
-    if not isinstance(push, SplitPush):
-        check_whole("push.sweeps", push.sweeps, 0)
-        check_rate(scene, "push.rate", push.rate)
+    push.check(scene)
     scheme, stop = check_rule(scene, scheme, stop)
     scene = with_near(scene)
     fitted, height = fit(scene, height)
@@ -436,7 +418,7 @@ def _follow(
     window: Whole | Window | None = None,
 ) -> tuple[Shaped, Any]:
     push, scheme, stop = rules
-    pushed, frames = way_of(scene, push)(scene, height, path, push, record)
+    pushed, frames = push.along(scene, height, path, record)
     return lifted(pushed, relax(scene, pushed.height, scheme, stop, Whole() if window is None else window)), frames
 
 
@@ -448,7 +430,7 @@ def lifted(pushed: Pushed, settled: Settled) -> Shaped:
 
 @jax.jit
 def _act(scene: Scene, height: jax.Array, path: jax.Array, rules: Rules) -> Pushed:
-    return way_of(scene, rules[0])(scene, height, path, rules[0])[0]
+    return rules[0].along(scene, height, path)[0]
 
 
 @jax.jit

@@ -11,7 +11,6 @@ Source: Pavlov & Johnson, ICRA 2019, restated in wheel_trench.py.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,11 +19,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.interaction._displacement import Job, whole
-from jaxsand.interaction._path import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._slices import hat, wedge
 from jaxsand.interaction.blade_closed_form import ROOM, complete, typical_drop
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Grousers, Pose, Wheel, carried_area, half_chord, local, reach
+from jaxsand.scene.tools import Grousers, NoTool, Pose, Wheel, carried_area, half_chord, local, reach
 from jaxsand.scene.window import Whole
 
 _SAMPLES = 8  # of the cut, along each side of a cell
@@ -56,9 +55,20 @@ class SplitPush:
         True
     """
 
+    def check(self, scene: Scene) -> None:
+        """Raises ValueError if the scene's tool is no wheel; see `PushRule`."""
+        if not isinstance(scene.tool, NoTool | Wheel):
+            raise ValueError(
+                f"push: got SplitPush for a {type(scene.tool).__name__}; SplitPush() is for a Wheel, SteppedPush() for both"
+            )
+
+    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Any]:
+        """Moves the scene's wheel along the path; see `PushRule`."""
+        return push_split(scene, height, path, self, record)
+
 
 def push_split(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SplitPush, record: Callable[[jax.Array], Any] | None = None
+    scene: Scene, height: jax.Array, path: jax.Array, push: SplitPush, record: Record | None = None
 ) -> tuple[Pushed, Any]:
     """Moves the wheel along the legs of `path` [n, 2] (m); see `along_legs`."""
     scene = replace(scene, window=Whole())

@@ -15,9 +15,8 @@ repose and above its complement the two agree.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -25,18 +24,20 @@ import jax.numpy as jnp
 from jaxsand.autodiff.while_loop import repeat, repeat_until
 from jaxsand.interaction._block import Block, Moving, Way
 from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, over_the_map, turn_between
 from jaxsand.interaction._rolling import Roll, Touchdown, Turn
 from jaxsand.interaction._wheel import Track
-from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.resting import no_flux
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, Smooth, carried_area, half_chord
 from jaxsand.scene.window import Window
 
+if TYPE_CHECKING:
+    from jaxsand.interaction.stepped import SteppedPush
+
 
 def roll_along(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SteppedPush, record: Callable[[jax.Array], Any] | None = None
+    scene: Scene, height: jax.Array, path: jax.Array, push: "SteppedPush", record: Record | None = None
 ) -> tuple[Pushed, Any]:
     """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
 
@@ -47,7 +48,7 @@ def roll_along(
 
 
 def _leg(
-    scene: Scene, push: SteppedPush, job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State
+    scene: Scene, push: "SteppedPush", job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State
 ) -> State:
     """Lowers the wheel, or turns it from the pose before, and moves it ahead by `length`, as far as that touches the map."""
     shape, drains = scene.grid.shape, job.bed.rim is not None

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.goals import metrics as task
-from jaxsand.interaction.blade_stepped import SteppedPush
 from jaxsand.interaction.simulate import Shaped, act, check, follow_frames
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.binary import Cell, connected_pieces, plan
 from jaxsand.planning.gradient import Optimised
 from jaxsand.planning.learned.stages import Planned

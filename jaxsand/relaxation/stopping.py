@@ -10,7 +10,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
-from jaxsand.scene.scene import Scene, as_array, check_window, concrete
+from jaxsand.scene.scene import Scene, as_array, check_window
+from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
 
 _MOST = 1_000_000_000  # sweeps, which are counted in 32 bits

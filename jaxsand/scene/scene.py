@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from jaxsand.scene.boundaries import Closed, Draining, Open, Walls
 from jaxsand.scene.grid import Grid, Neighbours
 from jaxsand.scene.material import DRY_SAND, Material
-from jaxsand.scene.tools import Blade, Grousers, NoTool, Smooth, Wheel
+from jaxsand.scene.tools import Blade, NoTool, Tool
+from jaxsand.scene.validation import concrete, finite, positive
 from jaxsand.scene.window import AsNeeded, Whole, Window
 
 T = TypeVar("T")
@@ -34,7 +35,7 @@ class Scene:
         walls: `Open`, or `Walls` with solid cells.
         edge: `Closed`, or `Draining` with sand running off over the map's edge.
         window: which part of the map is computed: `AsNeeded`, `Whole` or `Window`.
-        tool: `NoTool`, `Blade` or `Wheel`.
+        tool: `NoTool`, `Blade`, `Wheel`, or another `Tool`.
 
     Example:
         A batch of scenes with three angles of repose, each with its own map:
@@ -55,7 +56,7 @@ class Scene:
     walls: Open | Walls = field(default_factory=Open)
     edge: Closed | Draining = field(default_factory=Closed)
     window: AsNeeded | Whole | Window = field(default_factory=AsNeeded)
-    tool: NoTool | Blade | Wheel = field(default_factory=NoTool)
+    tool: Tool = field(default_factory=NoTool)
 
 
 def make_scene(
@@ -64,7 +65,7 @@ def make_scene(
     repose_angle: Float[ArrayLike, ""] | Float[ArrayLike, "H W"] = DRY_SAND.repose_angle,
     neighbours: Neighbours = 8,
     *,
-    tool: NoTool | Blade | Wheel | None = None,
+    tool: Tool | None = None,
     walls: Open | Walls | None = None,
     edge: Closed | Draining | None = None,
     window: AsNeeded | Whole | Window | None = None,
@@ -77,7 +78,7 @@ def make_scene(
         repose_angle: angle of repose (rad), above 0 and below pi/2: a scalar, or one angle per cell [H, W].
         neighbours: between which cells repose holds: 4, 8 (diagonal neighbours are sqrt(2) dx apart), or "isotropic" (the
             length of the gradient is limited).
-        tool: a `Blade` or a `Wheel`; None for no tool.
+        tool: a `Blade`, a `Wheel`, or another `Tool`; None for no tool.
         walls: `Walls` with solid cells; None for none.
         edge: `Draining` where sand runs off over the map's edge; None for a closed edge.
         window: `Window` or `Whole`, the part of the map that is computed; None for `AsNeeded`.
@@ -101,7 +102,7 @@ def make_scene(
         ValueError: spacing: got -1; it must be one finite number above 0: ...
     """
     shape = _shape(shape)
-    _positive("spacing", spacing, "give the distance of cell centres in metres, such as 0.01")
+    positive("spacing", spacing, "give the distance of cell centres in metres, such as 0.01")
     _angle(repose_angle, shape)
     known = neighbours == "isotropic" if isinstance(neighbours, str) else isinstance(neighbours, int | np.integer)
     if not known or neighbours not in (4, 8, "isotropic"):
@@ -117,7 +118,12 @@ def make_scene(
     _check_walls(scene.walls, shape)
     _check_edge(scene.edge)
     check_window(scene.window, shape)
-    _check_tool(scene.tool, scene.grid)
+    if isinstance(scene.tool, type) or not isinstance(scene.tool, Tool):
+        raise ValueError(
+            f"tool: got {tool!r}; give NoTool(), Blade(width, thickness, depth), Wheel(radius, width, sinkage), "
+            "or a Tool of your own"
+        )
+    scene.tool.check(scene.grid)
     return scene
 
 
@@ -197,17 +203,6 @@ def cast(tree: T, dtype: DTypeLike) -> T:
     return jax.tree.map(one, tree)
 
 
-def concrete(value: object) -> np.ndarray | None:
-    """The value as a numpy array (NaN for what is no number), or None if it is being traced."""
-    if isinstance(value, jax.core.Tracer):
-        return None
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):
-        return None
-    return array if array.dtype.kind in "fiub" else np.full((), np.nan)
-
-
 def _number(value: ArrayLike) -> Any:
     return float(value) if isinstance(value, (int, float)) else value
 
@@ -221,22 +216,6 @@ def _shape(shape: tuple[int, int]) -> tuple[int, int]:
     if not good:
         raise ValueError(f"shape: got {shape!r}; give two whole numbers of at least 1, (rows, columns)")
     return int(rows), int(columns)
-
-
-def _positive(name: str, value: object, remedy: str) -> None:
-    array = concrete(value)
-    if array is not None and not (array.ndim == 0 and np.isfinite(array) and array > 0):
-        raise ValueError(f"{name}: got {_short(value)}; it must be one finite number above 0: {remedy}")
-
-
-def _finite(name: str, value: object, remedy: str) -> None:
-    array = concrete(value)
-    if array is not None and not (array.ndim == 0 and np.isfinite(array)):
-        raise ValueError(f"{name}: got {_short(value)}; it must be one finite number: {remedy}")
-
-
-def _short(value: Any) -> str:
-    return repr(value) if np.ndim(value) == 0 else f"an array of shape {list(np.shape(value))}"
 
 
 def _angle(angle: object, shape: tuple[int, int]) -> None:
@@ -270,7 +249,7 @@ def _check_walls(walls: object, shape: tuple[int, int]) -> None:
 
 def _check_edge(edge: object) -> None:
     if isinstance(edge, Draining):
-        _finite("edge.level", edge.level, "give the height of the rim in metres")
+        finite("edge.level", edge.level, "give the height of the rim in metres")
     elif not isinstance(edge, Closed):
         raise ValueError(f"edge: got {edge!r}; give Closed() or Draining(level)")
 
@@ -293,65 +272,3 @@ def check_window(window: object, shape: tuple[int, int]) -> None:
             raise ValueError(f"window.tolerance: got {window.tolerance!r}; give 0 or a small positive number of spacings")
     elif not isinstance(window, AsNeeded | Whole):
         raise ValueError(f"window: got {window!r}; give AsNeeded(), Whole() or Window(size)")
-
-
-def _check_tool(tool: object, grid: Grid) -> None:
-    if isinstance(tool, Blade):
-        _positive("tool.width", tool.width, "give the blade's width in metres")
-        _positive("tool.thickness", tool.thickness, "give the blade's thickness in metres")
-        _finite("tool.depth", tool.depth, "give the depth of the blade's bottom below height 0 in metres")
-        thickness, dx = concrete(tool.thickness), concrete(grid.spacing)
-        if thickness is None or dx is None:
-            return
-        for name, extent in (("width", concrete(tool.width)), ("thickness", thickness)):
-            if extent is not None and np.any(extent < dx * (1 - 1e-6)):
-                raise ValueError(
-                    f"tool.{name}: got {getattr(tool, name)!r} m, less than a cell of {grid.spacing!r} m; "
-                    "enlarge the blade or refine the grid"
-                )
-        if np.any(thickness > dx * max(2, math.hypot(*grid.shape))):
-            raise ValueError(
-                f"tool.thickness: got {tool.thickness!r} m, more than the map's diagonal; "
-                "give lengths in metres, or enlarge the map"
-            )
-    elif isinstance(tool, Wheel):
-        _check_wheel(tool, grid)
-    elif not isinstance(tool, NoTool):
-        raise ValueError(
-            f"tool: got {tool!r}; give NoTool(), Blade(width, thickness, depth) or Wheel(radius, width, sinkage)"
-        )
-
-
-def _check_wheel(wheel: Wheel, grid: Grid) -> None:
-    for name in ("radius", "width", "sinkage"):
-        _positive(f"tool.{name}", getattr(wheel, name), f"give the wheel's {name} in metres")
-    _finite("tool.slip_angle", wheel.slip_angle, "give the angle from the wheel's plane to its way in rad")
-    radius, width, sinkage, slip, dx = map(
-        concrete, (wheel.radius, wheel.width, wheel.sinkage, wheel.slip_angle, grid.spacing)
-    )
-    if sinkage is not None and radius is not None and sinkage > radius:
-        raise ValueError(f"tool.sinkage: got {wheel.sinkage!r} m, deeper than the axle; give at most the radius")
-    if slip is not None and abs(slip) > math.pi / 2 * (1 + 1e-6):
-        raise ValueError(
-            f"tool.slip_angle: got {wheel.slip_angle!r} rad; give -pi/2 to pi/2: for degrees use math.radians(45)"
-        )
-    if dx is not None:
-        for name, extent in (("radius", radius), ("width", width)):
-            if extent is not None and extent < dx * (1 - 1e-6):
-                raise ValueError(
-                    f"tool.{name}: got {getattr(wheel, name)!r} m, less than a cell of {grid.spacing!r} m; "
-                    "enlarge the wheel or refine the grid"
-                )
-            if extent is not None and extent > dx * max(2, math.hypot(*grid.shape)):
-                raise ValueError(
-                    f"tool.{name}: got {getattr(wheel, name)!r} m, more than the map's diagonal; "
-                    "give lengths in metres, or enlarge the map"
-                )
-    if isinstance(wheel.grousers, Grousers):
-        for name in ("height", "fill", "spin"):
-            value = concrete(getattr(wheel.grousers, name))
-            if value is not None and not (value.ndim == 0 and np.isfinite(value) and value >= 0):
-                got = _short(getattr(wheel.grousers, name))
-                raise ValueError(f"tool.grousers.{name}: got {got}; it must be one finite number of 0 or more")
-    elif not isinstance(wheel.grousers, Smooth):
-        raise ValueError(f"tool.grousers: got {wheel.grousers!r}; give Smooth() or Grousers(height, fill, spin)")

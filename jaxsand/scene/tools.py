@@ -1,14 +1,41 @@
 """Tools: their geometry, their poses, and the share of each cell that they cover."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import Field, dataclass, field
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from jaxsand.scene.grid import Grid
+from jaxsand.scene.validation import concrete, finite, positive, short
 
 Scalar = Float[Array, ""]
 Number = Scalar | float
+
+
+@runtime_checkable
+class Tool(Protocol):
+    """What a scene can have as its tool: a frozen dataclass, registered as a pytree, that checks its own fields.
+
+    Fields that are numbers are leaves, which `jax.vmap` batches and `jax.grad` differentiates by. What a tool does to the
+    sand is up to a `PushRule`. The site's guide "A new tool" builds a round rod in a page.
+
+    Example:
+        >>> import jaxsand as js
+        >>> isinstance(js.Blade(), js.Tool), isinstance("a spade", js.Tool)
+        (True, False)
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def check(self, grid: Grid) -> None:
+        """Raises ValueError, which names the field, the value and the remedy, if the tool makes no sense on the grid.
+
+        Called by `make_scene`. Values that are being traced are not known yet and pass.
+        """
 
 
 @jax.tree_util.register_dataclass
@@ -21,6 +48,9 @@ class NoTool:
         >>> js.make_scene((8, 8), 0.01).tool
         NoTool()
     """
+
+    def check(self, grid: Grid) -> None:
+        """Nothing can be wrong."""
 
 
 @jax.tree_util.register_dataclass
@@ -46,6 +76,17 @@ class Blade:
     width: Number = 0.02
     thickness: Number = 0.015
     depth: Number = 0.0075
+
+    def check(self, grid: Grid) -> None:
+        """Raises ValueError if a length is out of range, or less than a cell; see `Tool`."""
+        positive("tool.width", self.width, "give the blade's width in metres")
+        positive("tool.thickness", self.thickness, "give the blade's thickness in metres")
+        finite("tool.depth", self.depth, "give the depth of the blade's bottom below height 0 in metres")
+        thickness, dx = concrete(self.thickness), concrete(grid.spacing)
+        if thickness is None or dx is None:
+            return
+        _at_least_a_cell("blade", {"width": self.width, "thickness": self.thickness}, grid)
+        _within_the_map({"thickness": self.thickness}, grid)
 
 
 @jax.tree_util.register_dataclass
@@ -114,13 +155,58 @@ class Wheel:
     slip_angle: Number = 0.0
     grousers: Smooth | Grousers = field(default_factory=Smooth)
 
+    def check(self, grid: Grid) -> None:
+        """Raises ValueError if a length or an angle is out of range; see `Tool`."""
+        for name in ("radius", "width", "sinkage"):
+            positive(f"tool.{name}", getattr(self, name), f"give the wheel's {name} in metres")
+        finite("tool.slip_angle", self.slip_angle, "give the angle from the wheel's plane to its way in rad")
+        radius, sinkage, slip = map(concrete, (self.radius, self.sinkage, self.slip_angle))
+        if sinkage is not None and radius is not None and sinkage > radius:
+            raise ValueError(f"tool.sinkage: got {self.sinkage!r} m, deeper than the axle; give at most the radius")
+        if slip is not None and abs(slip) > math.pi / 2 * (1 + 1e-6):
+            raise ValueError(
+                f"tool.slip_angle: got {self.slip_angle!r} rad; give -pi/2 to pi/2: for degrees use math.radians(45)"
+            )
+        sizes = {"radius": self.radius, "width": self.width}
+        _at_least_a_cell("wheel", sizes, grid)
+        _within_the_map(sizes, grid)
+        if isinstance(self.grousers, Grousers):
+            for name in ("height", "fill", "spin"):
+                value = concrete(getattr(self.grousers, name))
+                if value is not None and not (value.ndim == 0 and np.isfinite(value) and value >= 0):
+                    got = short(getattr(self.grousers, name))
+                    raise ValueError(f"tool.grousers.{name}: got {got}; it must be one finite number of 0 or more")
+        elif not isinstance(self.grousers, Smooth):
+            raise ValueError(f"tool.grousers: got {self.grousers!r}; give Smooth() or Grousers(height, fill, spin)")
+
+
+def _at_least_a_cell(kind: str, sizes: dict[str, Number], grid: Grid) -> None:
+    dx = concrete(grid.spacing)
+    for name, value in sizes.items():
+        size = concrete(value)
+        if size is not None and dx is not None and np.any(size < dx * (1 - 1e-6)):
+            raise ValueError(
+                f"tool.{name}: got {value!r} m, less than a cell of {grid.spacing!r} m; "
+                f"enlarge the {kind} or refine the grid"
+            )
+
+
+def _within_the_map(sizes: dict[str, Number], grid: Grid) -> None:
+    dx = concrete(grid.spacing)
+    for name, value in sizes.items():
+        size = concrete(value)
+        if size is not None and dx is not None and np.any(size > dx * max(2, math.hypot(*grid.shape))):
+            raise ValueError(
+                f"tool.{name}: got {value!r} m, more than the map's diagonal; give lengths in metres, or enlarge the map"
+            )
+
 
 def lowest(tool: Blade | Wheel) -> Scalar:
     """The height of the tool's lowest point (m)."""
     return -jnp.asarray(tool.sinkage if isinstance(tool, Wheel) else tool.depth)
 
 
-def usable(tool: NoTool | Blade | Wheel) -> Bool[Array, ""]:
+def usable(tool: Tool) -> Bool[Array, ""]:
     """Whether the tool's numbers are finite and, for a wheel, in range; checks traced values, which `make_scene` cannot."""
     good = jnp.ones((), bool)
     for leaf in jax.tree.leaves(tool):

@@ -13,13 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxsand.interaction.simulate import Push, check_push, rollout
+from jaxsand.interaction.rule import PushRule
+from jaxsand.interaction.simulate import check_push, rollout
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
 from jaxsand.scene.material import Material
-from jaxsand.scene.scene import Scene, as_array, concrete, fit
+from jaxsand.scene.scene import Scene, as_array, fit
 from jaxsand.scene.tools import NoTool
+from jaxsand.scene.validation import concrete
 from jaxsand.terramechanics._least_squares import (
     Calibration,
     Ends,
@@ -38,7 +40,7 @@ _REPOSE = "repose_angle"
 _TWO = TwoGrids()
 _FINER = 3  # an odd number: cells of both grids have their middles in common
 _ANGLES = (math.radians(10), math.radians(50))
-_Rules = tuple[Push | None, Scheme | None, Stop | None]
+_Rules = tuple[PushRule | None, Scheme | None, Stop | None]
 _Labels = np.ndarray | jax.Array | None
 
 
@@ -83,7 +85,7 @@ def calibrate(
     regions: ArrayLike | jax.Array | None = None,
     noise: float | None = None,
     starts: int = 6,
-    push: Push | None = None,
+    push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     grid: TwoGrids | OneGrid = _TWO,
@@ -181,7 +183,7 @@ def _climbs(
 
 
 def _reference(
-    scene: Scene, push: Push | None, labels: _Labels, groups: list[_Group], box: jax.Array, names: tuple[str, ...]
+    scene: Scene, push: PushRule | None, labels: _Labels, groups: list[_Group], box: jax.Array, names: tuple[str, ...]
 ) -> Reference:
     """Runs isotropic sand on the scene's grid and on a finer one, for `seek_limit`."""
     coarse = isotropic(scene)
@@ -203,7 +205,7 @@ def _reference(
 
 @partial(jax.jit, static_argnames="names")
 def _refers(
-    scene: Scene, labels: _Labels, groups: list[_Group], push: Push | None, values: jax.Array, names: tuple[str, ...]
+    scene: Scene, labels: _Labels, groups: list[_Group], push: PushRule | None, values: jax.Array, names: tuple[str, ...]
 ) -> tuple[jax.Array, jax.Array]:
     return _misfits(_with(scene, names, labels, values), (push, None, None), groups)
 

@@ -21,8 +21,9 @@ import numpy as np
 from jax import lax
 
 from jaxsand.scene.grid import centres
-from jaxsand.scene.scene import Scene, cast, concrete, fit
+from jaxsand.scene.scene import Scene, cast, fit
 from jaxsand.scene.tools import Blade, Pose, coverage
+from jaxsand.scene.validation import concrete
 
 Scalar = jax.Array | float
 _TINY = float(np.finfo(np.float32).tiny)

@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.interaction.blade_stepped import SteppedPush
-from jaxsand.interaction.simulate import Push, check, step
+from jaxsand.interaction.rule import PushRule
+from jaxsand.interaction.simulate import check, step
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation.batching import cores
 from jaxsand.scene.progress import Tell, quiet
@@ -31,7 +32,7 @@ Trench = tuple[float, float]  # slip angle (degrees), sinkage (mm)
 ANGLES = (0.0, 22.5, 45.0, 67.5, 90.0)
 SINKAGES = (5.0, 15.0, 25.0)
 TRENCHES: tuple[Trench, ...] = tuple((beta, sinkage) for sinkage in SINKAGES for beta in ANGLES)
-RULES: dict[str, Push] = {"own": SteppedPush(), "split": SplitPush()}
+RULES: dict[str, PushRule] = {"own": SteppedPush(), "split": SplitPush()}
 FIGURES = ("mean_abs_mm", "median_abs_mm", "depth_error_mm")
 # arXiv:1908.02745: its simulator over 14 trenches, against the closed form and against LIDAR scans (mm).
 PAPER = {
@@ -60,7 +61,7 @@ class Rut:
     seconds: float
 
 
-def simulate(trench: Trench, spacing: float, push: Push) -> Rut:
+def simulate(trench: Trench, spacing: float, push: PushRule) -> Rut:
     """Tows the paper's wheel one metre over level sand on cells of `spacing` (m), and takes the section half-way.
 
     The wheel runs along the middle of a row of cells. The sand is computed in a window that follows the wheel, and settles
@@ -89,7 +90,7 @@ def simulate(trench: Trench, spacing: float, push: Push) -> Rut:
     return Rut(half, float(np.abs(half.z - earlier.z).mean()), seconds)
 
 
-def simulate_all(trenches: Iterable[Trench], spacing: float, push: Push, tell: Tell = quiet) -> dict[Trench, Rut]:
+def simulate_all(trenches: Iterable[Trench], spacing: float, push: PushRule, tell: Tell = quiet) -> dict[Trench, Rut]:
     """Calls `simulate` for every trench, on all cores."""
     trenches = list(trenches)
 

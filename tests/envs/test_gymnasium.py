@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 import jaxsand.gym
 from jaxsand.envs import LevelGoals, OnlyDug, OnSand, Stop, Together, map_pool
 from jaxsand.goals.letters import letter_map
-from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.stepped import SteppedPush
 
 POOL = map_pool([letter_map(name)[0] for name in "LT"])
 RAISED = np.zeros((2, 32, 32), np.float32)

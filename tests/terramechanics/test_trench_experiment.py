@@ -9,7 +9,7 @@ import pytest
 
 from jaxsand.__main__ import main
 from jaxsand.bench import trenches as rutbench
-from jaxsand.interaction.blade_stepped import SteppedPush
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.terramechanics import scans
 from jaxsand.terramechanics import trench_experiment as rut
 

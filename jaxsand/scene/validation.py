@@ -1,0 +1,33 @@
+"""Checks of single values: messages name the field, the value and the remedy; what is being traced passes."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+
+def concrete(value: object) -> np.ndarray | None:
+    """The value as a numpy array (NaN for what is no number), or None if it is being traced."""
+    if isinstance(value, jax.core.Tracer):
+        return None
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):
+        return None
+    return array if array.dtype.kind in "fiub" else np.full((), np.nan)
+
+
+def positive(name: str, value: object, remedy: str) -> None:
+    array = concrete(value)
+    if array is not None and not (array.ndim == 0 and np.isfinite(array) and array > 0):
+        raise ValueError(f"{name}: got {short(value)}; it must be one finite number above 0: {remedy}")
+
+
+def finite(name: str, value: object, remedy: str) -> None:
+    array = concrete(value)
+    if array is not None and not (array.ndim == 0 and np.isfinite(array)):
+        raise ValueError(f"{name}: got {short(value)}; it must be one finite number: {remedy}")
+
+
+def short(value: Any) -> str:
+    return repr(value) if np.ndim(value) == 0 else f"an array of shape {list(np.shape(value))}"
