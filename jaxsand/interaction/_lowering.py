@@ -1,4 +1,4 @@
-"""A blade is lowered: what it covers leaves radially."""
+"""Lowers a blade: the sand that it covers is displaced radially."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,7 @@ from jaxsand.relaxation.ghost_cells import at, truncate
 
 @dataclass(frozen=True)
 class Lower(Step):
-    """The blade comes down: what it covers leaves radially, until all of it rests."""
+    """The step in which the blade comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1
 
@@ -50,7 +50,7 @@ class Lower(Step):
 
 
 def _spread(params: Any, k: jax.Array, state: Any) -> Any:
-    """Sand handed on by one cell: it comes to rest in the open share of cells, and moves on in the rest."""
+    """Moves the carried sand by one cell: it stays in the open share of cells, and is carried on in the covered share."""
     shares, holds, cover, over = params
     h, gone, carried = state
     free = None if over is None else (over[0], over[1] * carried)
@@ -60,4 +60,5 @@ def _spread(params: Any, k: jax.Array, state: Any) -> Any:
 
 
 def _at_rest(params: Any, k: jax.Array, state: Any) -> jax.Array:
+    """Whether no sand is being carried any more."""
     return ~jnp.any(state[2] > 0)

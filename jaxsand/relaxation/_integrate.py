@@ -1,4 +1,4 @@
-"""How a scheme marches: groups of sweeps until the map is still, on one grid."""
+"""Integrates the flow of sand on one grid: groups of sweeps until the map is still."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,16 +18,20 @@ from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.relaxation.sweep import Flow, Sweep, apply
 from jaxsand.scene.grid import links
 
-Sand = tuple[jax.Array, Lost]  # a map with halo, and what it lost over the rim
+Sand = tuple[jax.Array, Lost]  # a map with ghost cells, and what it lost over the rim
 
 
 @dataclass(frozen=True)
 class March:
-    """Sweeps in groups of `interval` until no slope exceeds repose by more than a tolerance.
+    """A loop over groups of `interval` sweeps, which ends when no slope exceeds repose by more than a tolerance.
 
-    `begin(sand)` is the state before the first group, whose first two members are the sand; `body(params, k, state)` the one
-    after group k; `done(params, k, state)` says whether to stop before group k; `between(k)` whether the sand alone is all
-    the state there.
+    Attributes:
+        begin: from the sand to the state before the first group, whose first two members are the sand.
+        body: from params, k and the state before group k to the state after it.
+        done: from params, k and the state, whether to stop before group k.
+        between: whether before group k the state holds nothing but the sand, so that the loop can be restarted there.
+        params: what `body` and `done` depend on.
+        interval: number of sweeps in a group.
     """
 
     begin: Callable[[Sand], Any]
@@ -50,9 +54,9 @@ def march(
     tolerance: jax.Array | None,
     interval: int,
 ) -> March:
-    """How the scheme marches on this bed; without a tolerance it is never done.
+    """The loop of a scheme on this bed; without a tolerance it runs to its bound.
 
-    The quantum follows the largest height down, so that a spike leaves sand as smooth as its remains allow.
+    Each group cuts fluxes to quanta of the heights that are left, so that a spike that wears off does not leave rough sand.
     """
     begin: Any
     body: Any
@@ -94,7 +98,7 @@ def _always(k: jax.Array) -> jax.Array:
 
 
 def still(bed: Bed, around: Nothing | Partial, limits: tuple[jax.Array, jax.Array], u: jax.Array) -> jax.Array:
-    """Whether no slope exceeds repose by more than the tolerance, or than the floats can move."""
+    """Whether no slope exceeds repose by more than the tolerance, or by more than what floats can still move."""
     tolerance, floor = limits
     if bed.neighbours == "isotropic":  # the larger part of a gradient moves at least 1/(4 sqrt(2)) of its excess
         floor = 3 * floor
@@ -131,6 +135,7 @@ def _pairs(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
 
 
 def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
+    """One sweep of `Pairwise`: in each direction every other pair, then the rest."""
     scale = flow.rate / flow.quantum
     for chosen, link in enumerate(links(bed.neighbours)):
         for colour in (0, 1):

@@ -1,4 +1,4 @@
-"""Super-time-stepping as a step of a loop: sweeps with momentum, and their derivative from a byte a cell and sweep."""
+"""RKL stages as steps of a loop: sweeps with momentum, and derivatives that store one byte for each cell and sweep."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,10 +17,10 @@ from jaxsand.relaxation.sweep import Flow, surge
 
 @dataclass(frozen=True)
 class Surges:
-    """Group k of `interval` sweeps of a schedule; `params` are the bed, the cells and limits that it does not use.
+    """A group of `interval` RKL stages of a schedule. `params` are the bed, the cells, and limits that it does not use.
 
-    Where sand flows in pairs over no rim it leaves two bits for each link and sweep on the tape, from which
-    flux_adjoint.py tells the derivative; elsewhere the state before the group, fluxes included.
+    With 4 or 8 neighbours and a closed edge it records two bits for each link and stage, from which flux_adjoint.py computes
+    the derivative. Else it records the state before the group, and JAX differentiates it.
     """
 
     plan: Schedule
@@ -120,7 +120,7 @@ class Surges:
         return floats, (halo(gain, 0.0), None, adjoint.from_lattice(bed, tuple(-p for p in last)))
 
     def _stages(self, k: jax.Array, dtype: Any) -> tuple[jax.Array, jax.Array]:
-        """The rates and the momenta of the group's sweeps."""
+        """The rate and the momentum of each stage of group k."""
         starts = jnp.asarray(self.plan.starts)[:, None]
         now = (k * self.interval + jnp.arange(self.interval, dtype=jnp.int32))[None, :]
         begun = starts <= now
@@ -132,21 +132,23 @@ class Surges:
 
 
 def _code(codes: jax.Array, i: jax.Array) -> jax.Array:
-    """What sweep i left on the tape, of which a word of 32 bits holds four."""
+    """The record of stage i in its low byte; a word of 32 bits holds the records of four stages."""
     word, shift = lax.optimization_barrier((lax.dynamic_index_in_dim(codes, i // 4, keepdims=False), 8 * (i % 4)))
     return lax.shift_right_logical(word, jnp.full(word.shape, shift, word.dtype))
 
 
 def _by_links(bed: Bed) -> bool:
+    """Whether the derivative follows from which links are active: with 4 or 8 neighbours and a closed edge."""
     return bed.neighbours != "isotropic" and bed.rim is None
 
 
 def _surface(around: Nothing | Partial, u: jax.Array) -> jax.Array:
+    """The height of the surface for a map of volumes per cell area, both with ghost cells."""
     return u if isinstance(around, Nothing) else halo(around.surface(at(u)))
 
 
 def _ease(around: Nothing | Partial, change: jax.Array) -> jax.Array:
-    """The surface's change for a change of what cells hold; symmetric."""
+    """The change of the surface for a change of the volume per cell area; a diagonal linear map, its own transpose."""
     return change if isinstance(around, Nothing) else around.surface(change)
 
 

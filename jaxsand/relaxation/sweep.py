@@ -1,4 +1,4 @@
-"""One sweep of settling: every link passes on its flux (flux.py), times a rate, cut to whole quanta (ghost_cells.py)."""
+"""One sweep of settling: every link moves its flux (flux.py) times a rate, cut to whole quanta (ghost_cells.py)."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,22 +16,22 @@ from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Flow:
-    """How far a sweep goes: the share of the excess that crosses a straight link, and the quantum it is cut to (m)."""
+    """The size of a sweep: the share of the excess that crosses a straight link, and the quantum of fluxes (m)."""
 
     rate: jax.Array
     quantum: jax.Array
 
 
 def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """One sweep of a map with halo [H + 2, W + 2].
+    """One sweep of a map with ghost cells [H + 2, W + 2], by forward Euler.
 
-    `lost` gathers the height that left each cell over a draining rim (see `lose`); None where nothing drains.
+    `lost` adds up the height that each cell lost over a draining rim (see `lose`); it is None where the edge is closed.
     """
     return apply(bed, flow, counted(flow, fluxes(bed, around, u)), u, lost)
 
 
 def counted(flow: Flow, driven: Fluxes) -> Fluxes:
-    """The whole quanta that cross the links for the fluxes at rate 1."""
+    """The numbers of quanta that cross the links in a sweep, from the fluxes at rate 1."""
     scale = flow.rate / flow.quantum
     return lax.optimization_barrier(tuple(truncate(f * scale) for f in driven))
 
@@ -39,7 +39,10 @@ def counted(flow: Flow, driven: Fluxes) -> Fluxes:
 def surge(
     bed: Bed, flow: Flow, momentum: jax.Array, around: Nothing | Partial, state: tuple[jax.Array, Lost, Fluxes]
 ) -> tuple[jax.Array, Lost, Fluxes]:
-    """A sweep that also repeats the share `momentum` of what each link moved in the last one (quanta)."""
+    """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before.
+
+    The state is a map with ghost cells, its account of losses, and what links moved last (in quanta).
+    """
     u, lost, last = state
     scale = flow.rate / flow.quantum
     moved = tuple(truncate(f * scale) + truncate(m * momentum) for f, m in zip(fluxes(bed, around, u), last, strict=True))
@@ -49,26 +52,29 @@ def surge(
 
 
 def apply(bed: Bed, flow: Flow, moved: Fluxes, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """The map with halo after whole quanta `moved` over its links; stored ones, lest each end compute its own."""
+    """The map with ghost cells after `moved` quanta crossed its links.
+
+    `moved` must be stored, behind a barrier, so that both ends of a link use the same number.
+    """
     h, lost = pass_over(bed, flow, moved, at(u), lost)
     return halo(h), lost
 
 
 def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """`apply` to a map [H, W] without halo."""
+    """`apply` for a map [H, W] without ghost cells."""
     if lost is not None:
         lost = lose(flow.quantum, lost, moved[-1] * flow.quantum)
     return h + gained(bed, moved) * flow.quantum, lost
 
 
 class Sweep(Plain):
-    """A sweep as a step of a loop; `params` are the bed, the flow and what is around, the state a map and what it lost."""
+    """A sweep as a step of a loop. `params` are the bed, the flow and the cells; the state is a map and its losses."""
 
     def __init__(self) -> None:
         super().__init__(lambda params, _, state: sweep(*params, *state))
 
     def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
-        """By hand where sand flows in pairs: from the heights, which tell the links that were active."""
+        """The vjp, with 4 or 8 neighbours and a closed edge by the formulas of flux_adjoint.py, else by JAX."""
         bed, flow, around = params
         if bed.neighbours == "isotropic" or bed.rim is not None:
             return super().pull(params, k, record, cotangent)
