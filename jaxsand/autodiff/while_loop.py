@@ -8,7 +8,7 @@ that it took. Each step decides what it records on a tape for its derivative.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,9 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxsand.autodiff import _batched_while as lockstep
-from jaxsand.autodiff._batched_while import Done, Tree
+from jaxsand.autodiff._batched_while import Done
+
+Tree: TypeAlias = lockstep.Tree
 
 
 class Step(Protocol):
@@ -144,12 +146,12 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
     # One flat vector, so that vmap sees a single operand that is batched or not.
     start, unravel = ravel_pytree((dparams, dstate))
 
-    def forward(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
+    def forward(_: object, vector: jax.Array) -> jax.Array:
         df, dx = unravel(vector)
         params, state, *_ = shown(kept)
         return ravel_pytree((df, lockstep.batched(lockstep.push, loop, params, state, count, df, dx)))[0]
 
-    def backward(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
+    def backward(_: object, vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
         params, _, tape, saved = shown(kept)
         df, dx = lockstep.batched(lockstep.pull, loop, params, count, tape, saved, cx)

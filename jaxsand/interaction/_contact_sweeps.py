@@ -8,18 +8,21 @@ l its length. A sweep adds G (rate g e / l) to the heights; see flux_adjoint.py.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.autodiff.while_loop import Plain, repeat, split
+from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Around, flows
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
+
+Params: TypeAlias = tuple[Bed, Flow, Around]
+State: TypeAlias = tuple[jax.Array, Lost]
 
 
 @dataclass(frozen=True)
@@ -29,16 +32,16 @@ class Beside:
     sweeps: int
     tape: int = 1
 
-    def __call__(self, params: Any, k: jax.Array, state: tuple[jax.Array, Lost]) -> tuple[jax.Array, Lost]:
+    def __call__(self, params: Params, k: jax.Array, state: State) -> State:
         return repeat(_SWEEP, self.sweeps, params, state)
 
-    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+    def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, State]:
         return self(params, k, state), state
 
-    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+    def push(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
         return Plain(self).push(params, k, record, dparams, dstate)
 
-    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+    def pull(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
         bed, flow, around = params
         if not by_hand(bed) or not self.sweeps:
             return Plain(self).pull(params, k, record, cotangent)

@@ -8,14 +8,11 @@ right, and the maps of a batch lie in the lanes of the vector unit. Flat maps [c
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxsand.scene.tools import Pose
-
-Block = Any
 
 
 @jax.tree_util.register_dataclass

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.autodiff.while_loop import Plain, repeat_until
+from jaxsand.autodiff.while_loop import Plain, Tree, repeat_until
 from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import Step
-from jaxsand.interaction._block import Moving, View, pose_ahead
+from jaxsand.interaction._block import Block, Moving, View, pose_ahead
 from jaxsand.interaction._frame import Frame, frame_of, shifted
 from jaxsand.interaction._turning import rotated
 from jaxsand.interaction._wheel import Stand, Track
@@ -21,6 +21,7 @@ from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.tools import Pose
 
 Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)
+Carried = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was lost, and what is carried (quanta)
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,14 @@ class Touchdown(Step):
 class _Onward:
     """The step in which sand under the wheel moves on by one cell."""
 
-    block: Any
+    block: Block
 
-    def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
+    def __call__(self, params: tuple[Track, View, wheel.Shares, Stand], k: jax.Array, state: Carried) -> Carried:
         track, view, shares, here = params
         return wheel.handed_on(self.block, track, view, shares, here, state)
 
 
-def _at_rest(params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _at_rest(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
     """Whether no sand is being carried any more."""
     return ~jnp.any(state[2] > 0)
 
@@ -77,7 +78,7 @@ class _Moved(Step):
         part: jax.Array,
         h: jax.Array,
         flux: Fluxes,
-        taken: Any,
+        taken: jax.Array,
     ) -> Sanded:
         """The sand after what was taken up has left the wheel's new place `now`, and was brought to rest around it."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
@@ -91,7 +92,7 @@ class _Moved(Step):
 class Turn(_Moved):
     """A sub-step of a turn in place, which moves the wheel's corners by `substep` spacings."""
 
-    def turned(self, track: Track, k: jax.Array, _: Any) -> jax.Array:
+    def turned(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
         """Whether the turn is complete before step k."""
         return jnp.all(k.astype(track.way.angle.dtype) * self._part(track) >= jnp.abs(track.way.angle))
 
@@ -129,7 +130,7 @@ class Roll(_Moved):
     chunk: int = 8
     lowered: bool = False
 
-    def arrived(self, track: Track, k: jax.Array, _: Any) -> jax.Array:
+    def arrived(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
         """Whether the leg is complete before step k."""
         steps = (k - int(self.lowered)).astype(track.way.length.dtype)
         return (k >= int(self.lowered)) & jnp.all(steps * (self.chunk * self.substep) >= track.way.length)

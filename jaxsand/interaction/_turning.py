@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,7 @@ class Turn(Step):
     sweeps: int = 4
     rest: Rest = bring_to_rest
 
-    def turned(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
+    def turned(self, way: Way, k: jax.Array, _: Moving) -> jax.Array:
         """Whether the turn is complete before step k."""
         return jnp.all(k.astype(way.angle.dtype) * self._part(way) >= jnp.abs(way.angle))
 

@@ -19,9 +19,7 @@ that volume is kept as well as floats allow.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +27,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._displacement import Job, contact, settle_around, take, whole
 from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
 from jaxsand.interaction._overflow import Rim, nothing_beyond
-from jaxsand.interaction._path import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._shade import on_line, within_reach
 from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
 from jaxsand.relaxation.ghost_cells import Lost, lose
@@ -96,8 +95,8 @@ class SwathPush:
 
 
 def push_swath(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SwathPush, record: Callable[[jax.Array], Any] | None = None
-) -> tuple[Pushed, Any]:
+    scene: Scene, height: jax.Array, path: jax.Array, push: SwathPush, record: Record | None = None
+) -> tuple[Pushed, Tree]:
     """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
     scene = replace(scene, window=Whole())
 

@@ -12,27 +12,30 @@ stroke.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import repeat, repeat_until
+from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
 from jaxsand.interaction._advance import Advance, Rest
 from jaxsand.interaction._block import SPARE, Block, Moving, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._lowering import Lower
-from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, over_the_map, turn_between
 from jaxsand.interaction._turning import Turn
 from jaxsand.interaction.resting import bring_to_rest, no_flux
 from jaxsand.scene.scene import Scene, concrete
 from jaxsand.scene.tools import Blade, Pose
 from jaxsand.scene.window import AsNeeded, Window
+
+Length = TypeVar("Length", float, jax.Array)
 
 
 @jax.tree_util.register_dataclass
@@ -75,9 +78,9 @@ def push_along(
     height: jax.Array,
     path: jax.Array,
     push: SteppedPush,
-    record: Callable[[jax.Array], Any] | None = None,
+    record: Record | None = None,
     rest: Rest = bring_to_rest,
-) -> tuple[Pushed, Any]:
+) -> tuple[Pushed, Tree]:
     """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`.
 
     `rest` is the function that brings the sand to rest after each sub-step.
@@ -164,7 +167,7 @@ def with_near(scene: Scene) -> Scene:
     return replace(scene, window=replace(scene.window, near=2 * math.floor(far) + 3))
 
 
-def _known(*leaves: Any) -> list[float] | None:
+def _known(*leaves: ArrayLike) -> list[float] | None:
     """The values as numbers, or None if one of them is traced or an array for many scenes."""
     found = [concrete(x) for x in leaves]
     if any(x is None or x.ndim for x in found):
@@ -172,7 +175,7 @@ def _known(*leaves: Any) -> list[float] | None:
     return [float(x) for x in found if x is not None]
 
 
-def _far(width: Any, thickness: Any) -> Any:
+def _far(width: Length, thickness: Length) -> Length:
     """The largest distance, in cells, from a block's middle to a cell that the blade covers.
 
     It allows for a footprint smoothed over a spacing, and for a block that stays put while the blade moves by a spacing.
@@ -184,7 +187,7 @@ _TOLERANCE = 1e-3  # a window's tolerance: the slope above repose that settling 
 _LEAST = 1.5  # a map's width over a window's, from which on the window saves work
 
 
-def windows_for(scene: Scene, push: Any, times: float = 1) -> Iterator[Scene]:
+def windows_for(scene: Scene, push: object, times: float = 1) -> Iterator[Scene]:
     """The scene with windows around its blade, each twice as wide as the one before, as long as that saves work.
 
     The first is `times` as wide as the blade and the heap that it pushes. The next is for sand that reaches its edge.

@@ -4,14 +4,15 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TypeVar
 
 import jax
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-from jaxsand.interaction._path import Pushed
+from jaxsand.autodiff.while_loop import Tree
+from jaxsand.interaction._path import Pushed, Record
 from jaxsand.interaction.blade_closed_form import SwathPush, push_swath
 from jaxsand.interaction.blade_stepped import SteppedPush, push_along, windows_for, with_near
 from jaxsand.interaction.wheel_closed_form import SplitPush, push_split
@@ -25,7 +26,8 @@ from jaxsand.scene.window import Whole, Window
 
 Push = SteppedPush | SwathPush | SplitPush
 Rules = tuple[Push, Scheme, Stop]
-_PUSHES: dict[tuple[type, type], Any] = {
+Result = TypeVar("Result", Pushed, "Shaped", tuple["Shaped", jax.Array])
+_PUSHES: dict[tuple[type, type], Callable[..., tuple[Pushed, Tree]]] = {
     (Blade, SteppedPush): push_along,
     (Blade, SwathPush): push_swath,
     (Wheel, SteppedPush): roll_along,
@@ -277,7 +279,9 @@ def rollout(
     return _as_needed(lambda scene, _: _rollout(scene, height, strokes, rules), scene, rules, (height, strokes))
 
 
-def _as_needed(run: Callable[[Scene, Whole | Window], Any], scene: Scene, rules: Rules, arrays: tuple[Any, Any]) -> Any:
+def _as_needed(
+    run: Callable[[Scene, Whole | Window], Result], scene: Scene, rules: Rules, arrays: tuple[jax.Array, jax.Array]
+) -> Result:
     """The result of `run(scene, settling window)` in the smallest window whose edge the sand does not reach.
 
     While values are traced there is one try, in a window that is wide enough for most strokes.
@@ -364,7 +368,7 @@ def check(result: Settled | Pushed) -> None:
     raise OutcomeError(where + "; ".join(advice.format(**detail) for bit, advice in _ADVICE.items() if bit in code))
 
 
-def way_of(scene: Scene, push: Push) -> Any:
+def way_of(scene: Scene, push: Push) -> Callable[..., tuple[Pushed, Tree]]:
     """The function that moves the scene's tool as the push says: of a scene, a map, a path, the push and a recorder."""
     return _PUSHES[type(scene.tool), type(push)]
 
@@ -432,9 +436,9 @@ def _follow(
     height: jax.Array,
     path: jax.Array,
     rules: Rules,
-    record: Any = None,
+    record: Record | None = None,
     window: Whole | Window | None = None,
-) -> tuple[Shaped, Any]:
+) -> tuple[Shaped, Tree]:
     push, scheme, stop = rules
     pushed, frames = way_of(scene, push)(scene, height, path, push, record)
     return lifted(pushed, relax(scene, pushed.height, scheme, stop, Whole() if window is None else window)), frames

@@ -6,7 +6,7 @@ functions differentiate in both modes. They cannot be vmapped: the last axis is 
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +17,12 @@ from jaxsand.relaxation.flux import Fluxes, ends, received
 from jaxsand.relaxation.ghost_cells import at, halo
 from jaxsand.scene.grid import Neighbours, links
 
+X = TypeVar("X")
+Y = TypeVar("Y")
 _SMALL = 24  # rows up to which a sum is written out
 
 
-def _linear(forth: Callable[..., Any], back: Callable[..., Any], x: Any) -> Any:
+def _linear(forth: Callable[[X], Y], back: Callable[[Y], X], x: X) -> Y:
     """The linear function `forth` of x, whose transpose is `back`."""
     return linear_call(lambda _, x: forth(x), lambda _, y: back(y), (), x)
 

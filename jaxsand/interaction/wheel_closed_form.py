@@ -11,16 +11,15 @@ Source: Pavlov & Johnson, ICRA 2019, restated in wheel_trench.py.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._displacement import Job, whole
-from jaxsand.interaction._path import Pushed, State, along_legs, corners, over_the_map
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._slices import hat, wedge
 from jaxsand.interaction.blade_closed_form import ROOM, complete, typical_drop
 from jaxsand.scene.scene import Scene
@@ -58,8 +57,8 @@ class SplitPush:
 
 
 def push_split(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SplitPush, record: Callable[[jax.Array], Any] | None = None
-) -> tuple[Pushed, Any]:
+    scene: Scene, height: jax.Array, path: jax.Array, push: SplitPush, record: Record | None = None
+) -> tuple[Pushed, Tree]:
     """Moves the wheel along the legs of `path` [n, 2] (m); see `along_legs`."""
     scene = replace(scene, window=Whole())
 
@@ -129,7 +128,7 @@ def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax
     It is sinkage (1 - x^2), middle x^2 + flanks x^3 = behind, by Newton's method, whose last step carries the derivative.
     """
 
-    def newton(_: Any, x: jax.Array) -> jax.Array:
+    def newton(_: int, x: jax.Array) -> jax.Array:
         steep = 2 * middle * x + 3 * flanks * x * x
         return x - (middle * x * x + flanks * x**3 - behind) / jnp.where(steep > 0, steep, 1)
 

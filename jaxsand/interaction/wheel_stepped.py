@@ -15,17 +15,15 @@ repose and above its complement the two agree.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxsand.autodiff.while_loop import repeat, repeat_until
+from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
 from jaxsand.interaction._block import Block, Moving, Way
 from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._path import Pushed, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, over_the_map, turn_between
 from jaxsand.interaction._rolling import Roll, Touchdown, Turn
 from jaxsand.interaction._wheel import Track
 from jaxsand.interaction.blade_stepped import SteppedPush
@@ -36,8 +34,8 @@ from jaxsand.scene.window import Window
 
 
 def roll_along(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SteppedPush, record: Callable[[jax.Array], Any] | None = None
-) -> tuple[Pushed, Any]:
+    scene: Scene, height: jax.Array, path: jax.Array, push: SteppedPush, record: Record | None = None
+) -> tuple[Pushed, Tree]:
     """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:

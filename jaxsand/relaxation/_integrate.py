@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +12,20 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
 from jaxsand.relaxation._rkl import Surges
-from jaxsand.relaxation.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
 from jaxsand.relaxation.ghost_cells import Bed, Lost, grain, truncate
 from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.relaxation.sweep import Flow, Sweep, apply
 from jaxsand.scene.grid import links
 
-Sand = tuple[jax.Array, Lost]  # a map with ghost cells, and what it lost over the rim
+Sand: TypeAlias = tuple[jax.Array, Lost]  # a map with ghost cells, and what it lost over the rim
+State: TypeAlias = Sand | tuple[jax.Array, Lost, Fluxes]
+Rate: TypeAlias = jax.Array | float
+Limits: TypeAlias = tuple[jax.Array, jax.Array]  # the tolerance, and the slope per quantum that floats can still move
+Params: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, *tuple[Rate, ...]]
+
+
+Swept: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, Rate]
 
 
 @dataclass(frozen=True)
@@ -34,11 +41,11 @@ class March:
         interval: number of sweeps in a group.
     """
 
-    begin: Callable[[Sand], Any]
+    begin: Callable[[Sand], State]
     body: Step
-    done: Callable[..., Any]
-    between: Callable[[jax.Array], Any]
-    params: Any
+    done: Callable[..., jax.Array]
+    between: Callable[[jax.Array], jax.Array]
+    params: Params
     interval: int
 
     def run(self, groups: int, sand: Sand) -> tuple[Sand, jax.Array]:
@@ -58,38 +65,37 @@ def march(
 
     Each group cuts fluxes to quanta of the heights that are left, so that a spike that wears off does not leave rough sand.
     """
-    begin: Any
-    body: Any
-    done: Any
-    between: Any
-    rate: Any
+    begin: Callable[[Sand], State]
+    body: Step
+    done: Callable[..., jax.Array]
+    between: Callable[[jax.Array], jax.Array]
+    rate: Rate
+    limits: Limits | None = None
     if isinstance(scheme, Schedule):
         begin = partial(_with_momentum, bed)
         body = Surges(scheme, interval)
         rate = float(scheme.rates[-1])
         done = partial(_still_after_a_step, scheme, interval)
         between = partial(_between_steps, scheme, interval)
-        params: Any = (bed, around, tolerance)
     else:
         begin = _as_it_is
         body = Plain(partial(_pairs if isinstance(scheme, Pairwise) else _sweeps, interval))
         rate = scheme.share / 2 if isinstance(scheme, Pairwise) else scheme.rate
         done, between = _still, _always
-        params = (bed, around, tolerance, rate)
     if tolerance is None:
         done = _never
     else:  # below this slope every flux is cut to nothing
         quanta = 4 if isinstance(scheme, Pairwise) and bed.rim is not None else 2
-        floor = lax.stop_gradient(quanta / (rate * bed.spacing))
-        params = (*params[:2], (tolerance, floor), *params[3:])
+        limits = (tolerance, lax.stop_gradient(quanta / (rate * bed.spacing)))
+    params: Params = (bed, around, limits) if isinstance(scheme, Schedule) else (bed, around, limits, rate)
     return March(begin, body, done, between, params, interval)
 
 
-def _with_momentum(bed: Bed, sand: Sand) -> Any:
+def _with_momentum(bed: Bed, sand: Sand) -> State:
     return (*sand, fluxes_zero(bed, sand[0]))
 
 
-def _as_it_is(sand: Sand) -> Any:
+def _as_it_is(sand: Sand) -> State:
     return sand
 
 
@@ -97,7 +103,7 @@ def _always(k: jax.Array) -> jax.Array:
     return jnp.ones((), bool)
 
 
-def still(bed: Bed, around: Nothing | Partial, limits: tuple[jax.Array, jax.Array], u: jax.Array) -> jax.Array:
+def still(bed: Bed, around: Nothing | Partial, limits: Limits, u: jax.Array) -> jax.Array:
     """Whether no slope exceeds repose by more than the tolerance, or by more than what floats can still move."""
     tolerance, floor = limits
     if bed.neighbours == "isotropic":  # the larger part of a gradient moves at least 1/(4 sqrt(2)) of its excess
@@ -105,16 +111,18 @@ def still(bed: Bed, around: Nothing | Partial, limits: tuple[jax.Array, jax.Arra
     return worst_excess(bed, u, around) <= jnp.maximum(tolerance, floor * grain(bed, u))
 
 
-def _never(params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _never(params: Params, k: jax.Array, state: State) -> jax.Array:
     return jnp.zeros((), bool)
 
 
-def _still(params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _still(params: tuple[Bed, Nothing | Partial, Limits, *tuple[Rate, ...]], k: jax.Array, state: State) -> jax.Array:
     bed, around, limits = params[:3]
     return still(bed, around, limits, state[0])
 
 
-def _still_after_a_step(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _still_after_a_step(
+    plan: Schedule, interval: int, params: tuple[Bed, Nothing | Partial, Limits], k: jax.Array, state: State
+) -> jax.Array:
     return _between_steps(plan, interval, k) & _still(params, k, state)
 
 
@@ -122,13 +130,13 @@ def _between_steps(plan: Schedule, interval: int, k: jax.Array) -> jax.Array:
     return jnp.any(jnp.asarray(plan.starts) == k * interval)
 
 
-def _sweeps(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
+def _sweeps(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
     bed, around, _, rate = params
     flow = Flow(jnp.asarray(rate), grain(bed, state[0]))
     return repeat(Sweep(), interval, (bed, flow, around), state)
 
 
-def _pairs(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
+def _pairs(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
     bed, _, _, half = params
     flow = Flow(jnp.asarray(half), grain(bed, state[0]))
     return repeat(_EACH_PAIR, interval, (bed, flow), state)

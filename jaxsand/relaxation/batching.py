@@ -9,26 +9,25 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.relaxation._integrate import March
+from jaxsand.autodiff.while_loop import Tree
+from jaxsand.relaxation._integrate import March, Sand
 from jaxsand.relaxation.ghost_cells import Lost
 
 _CELLS = 65_536  # cells in a chunk, whose sweep then works in a core's cache
 _LEFT = 8  # a chunk stops when one in so many of its maps still moves
-Tree = Any
 
 
 def march_batch(
     march: March,
     groups: int,
-    enter: Callable[..., Any],
-    judge: Callable[..., Any],
+    enter: Callable[[jax.Array, Lost], Sand],
+    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
     height: jax.Array,
     lost: Lost,
     chunk: int,
@@ -48,7 +47,7 @@ def march_batch(
     return state[0]
 
 
-def _left_over(run: Callable[..., Any], chunk: int, state: Tree) -> Tree:
+def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
     """The state after chunks of the maps that still move were swept once more until few are left."""
     _, _, taken, ready = state
     order = jnp.argsort(jnp.where(ready, jnp.iinfo(jnp.int32).max, taken))
@@ -66,13 +65,13 @@ def _left_over(run: Callable[..., Any], chunk: int, state: Tree) -> Tree:
 def _together(
     march: March,
     groups: int,
-    enter: Callable[..., Any],
-    judge: Callable[..., Any],
-    others: Any,
-    height: Any,
-    lost: Any,
-    taken: Any,
-    ready: Any,
+    enter: Callable[[jax.Array, Lost], Sand],
+    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
+    others: jax.Array | bool,
+    height: jax.Array,
+    lost: Lost,
+    taken: jax.Array,
+    ready: jax.Array,
 ) -> Tree:
     """Sweeps the maps of a chunk until all are ready; where there are `others` to join, until all but a few are.
 
@@ -170,7 +169,7 @@ def group_size(total: int, chunk: int | None) -> int:
     return next((size for size in SIZES if size * cores() >= total), SIZES[-1])
 
 
-def _refuse_tracers(leaves: list[Any]) -> None:
+def _refuse_tracers(leaves: list[object]) -> None:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         raise ValueError(
             "settle_batch, step_batch and their like are outermost programs: inside jit, grad or vmap use jax.vmap of "
@@ -178,7 +177,7 @@ def _refuse_tracers(leaves: list[Any]) -> None:
         )
 
 
-def in_turns(runs: Sequence[Callable[[Any], Tree]], flagged: Callable[[Tree], jax.Array]) -> Tree:
+def in_turns(runs: Sequence[Callable[[slice | np.ndarray], Tree]], flagged: Callable[[Tree], jax.Array]) -> Tree:
     """The results of the first of `runs` for a batch; those that `flagged` marks are replaced by the second's, and so on.
 
     A run is a function of the indices of maps that returns their results.
@@ -202,7 +201,7 @@ def processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def wide_vectors() -> dict[str, Any]:
+def wide_vectors() -> dict[str, int]:
     """Compiler options for the outermost programs: 512-bit vectors where the CPU has them."""
     return {"xla_cpu_prefer_vector_width": 512} if _on_cpu() else {}
 

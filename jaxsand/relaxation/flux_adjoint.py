@@ -13,7 +13,6 @@ map with ghost cells meet. Two bits for each link say whether it is active, and 
 """
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -75,9 +74,9 @@ def active(bed: Bed, s: jax.Array) -> jax.Array:
     return code
 
 
-def opened(bed: Bed, gate: jax.Array | None) -> list[Any]:
+def opened(bed: Bed, gate: jax.Array | None) -> list[jax.Array | float]:
     """The part of a surface's excess that flows over each link at rate 1; `gate` is the open share of each cell."""
-    lengths = [1 / length for _, _, length in links(bed.neighbours)]
+    lengths: list[jax.Array | float] = [1 / length for _, _, length in links(bed.neighbours)]
     if gate is None:
         return lengths
     return [jnp.minimum(here, there) * w for (here, there), w in zip(pairs(bed, gate), lengths, strict=True)]

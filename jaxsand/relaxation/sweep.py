@@ -1,13 +1,12 @@
 """One sweep of settling: every link moves its flux (flux.py) times a rate, cut to whole quanta (ghost_cells.py)."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.autodiff.while_loop import Plain, split
+from jaxsand.autodiff.while_loop import Plain, Tree, split
 from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
@@ -73,7 +72,13 @@ class Sweep(Plain):
     def __init__(self) -> None:
         super().__init__(lambda params, _, state: sweep(*params, *state))
 
-    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+    def pull(
+        self,
+        params: tuple[Bed, Flow, Nothing | Partial],
+        k: jax.Array,
+        record: tuple[jax.Array, Lost],
+        cotangent: tuple[jax.Array, Lost],
+    ) -> tuple[Tree, tuple[jax.Array, Lost]]:
         """The vjp, with 4 or 8 neighbours and a closed edge by the formulas of flux_adjoint.py, else by JAX."""
         bed, flow, around = params
         if bed.neighbours == "isotropic" or bed.rim is not None:
