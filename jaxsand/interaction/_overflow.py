@@ -85,7 +85,7 @@ class Rim:
         return holds
 
     def room(self, job: Job, h: jax.Array, mu: jax.Array) -> jax.Array:
-        """How much higher than h sand can stand in each cell: mu times the distance to the rim above the rim (m)."""
+        """How much higher than h sand can stand (m): at the distance r from the rim, up to mu r above the rim."""
         return jnp.maximum(self.level + mu * self.away * job.bed.spacing - jnp.where(jnp.isnan(h), 0, h), 0)
 
 

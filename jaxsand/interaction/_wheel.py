@@ -121,7 +121,7 @@ def leaving(track: Track, frame: Frame, wheel: Stand) -> Shares:
     """The shares of the four neighbours for displacement by a wheel that moves ahead.
 
     As components (along the wheel's plane, along its axle), with u from -1 at one flank to 1 at the other, sand leaves the
-    rim along (1, u / 2), and the leading flank and two spacings beside it along (0, 1). Where a face is within 30 degrees of
+    rim along (1, u / 2), and within two spacings of the leading flank along (0, 1). Where a face is within 30 degrees of
     the direction of travel, sand is turned towards that direction.
     """
     slip = track.seen(frame)

@@ -75,8 +75,8 @@ class SteppedPush:
 
 def push_along(
     scene: Scene,
-    height: jax.Array,
-    path: jax.Array,
+    height: Float[Array, "H W"],
+    path: Float[Array, "n 2"],
     push: SteppedPush,
     record: Record | None = None,
     rest: Rest = bring_to_rest,

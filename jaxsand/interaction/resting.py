@@ -28,12 +28,14 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxsand.interaction.stencil import both_ends, inner, net, outer, rises
 from jaxsand.relaxation.flux import Fluxes, ends
 from jaxsand.relaxation.ghost_cells import nearest, truncate
 from jaxsand.scene.grid import Neighbours, links
 
+Map = Float[Array, "m m ..."]  # a block, or one for each map of a batch in the last axis
 _FELT = 0.25  # the open share from which on a link counts in full in a gradient
 _CALM = 0.6  # factor of the rate of isotropic sand, which overshoots at the full rate when it starts from a guess
 _GUESSED = 0.07  # the open share from which on a guess counts in full; less is closer to the limit but less smooth
@@ -57,20 +59,20 @@ class Sand:
     """
 
     gates: Fluxes
-    open: jax.Array
-    stretch: jax.Array
-    bottom: jax.Array
-    drop: jax.Array
-    sides: jax.Array | None
-    rim: jax.Array | None
+    open: Map
+    stretch: Map
+    bottom: Map | Float[Array, "..."]
+    drop: Map | Float[Array, "..."]
+    sides: Map | None
+    rim: Float[Array, "..."] | None
     neighbours: Neighbours = field(metadata={"static": True})
 
-    def surface(self, h: jax.Array) -> jax.Array:
+    def surface(self, h: Map) -> Map:
         """The height at which the sand of each cell stands in its open share."""
         return h + self.stretch * jnp.where(h > self.bottom, h - self.bottom, 0)
 
 
-def no_flux(neighbours: Neighbours, drains: bool, h: jax.Array) -> Fluxes:
+def no_flux(neighbours: Neighbours, drains: bool, h: Map) -> Fluxes:
     """Fluxes of 0 for a block of heights [m, m]."""
     if neighbours == "isotropic":
         maps = [jnp.zeros_like(h)] * 8
@@ -80,7 +82,7 @@ def no_flux(neighbours: Neighbours, drains: bool, h: jax.Array) -> Fluxes:
     return (*maps, jnp.zeros_like(h)) if drains else tuple(maps)
 
 
-def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
+def bring_to_rest(sand: Sand, rate: Float[Array, "..."], sweeps: int, h: Map, guess: Fluxes) -> tuple[Map, Fluxes]:
     """The heights after a number of proximal steps that start from a guess of the fluxes, and the fluxes."""
     model: Links | _Gradients = Links(sand, rate)
     if sand.neighbours == "isotropic":

@@ -12,11 +12,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import linear_call
+from jaxtyping import Array, Float
 
 from jaxsand.relaxation.flux import Fluxes, ends, received
 from jaxsand.relaxation.ghost_cells import at, halo
 from jaxsand.scene.grid import Neighbours, links
 
+Map = Float[Array, "m n ..."]  # a map, or one for each map of a batch in the last axis
+Ghosted = Float[Array, "m+2 n+2 ..."]  # with ghost cells
 X = TypeVar("X")
 Y = TypeVar("Y")
 _SMALL = 24  # rows up to which a sum is written out
@@ -27,37 +30,37 @@ def _linear(forth: Callable[[X], Y], back: Callable[[Y], X], x: X) -> Y:
     return linear_call(lambda _, x: forth(x), lambda _, y: back(y), (), x)
 
 
-def steps(neighbours: Neighbours, s: jax.Array) -> Fluxes:
+def steps(neighbours: Neighbours, s: Map) -> Fluxes:
     """The step over every link, from its first cell to its second; the height beyond the map is 0."""
     return _linear(partial(_steps, neighbours), lambda y: -received(neighbours, y), s)
 
 
-def rises(neighbours: Neighbours, u: jax.Array) -> Fluxes:
+def rises(neighbours: Neighbours, u: Ghosted) -> Fluxes:
     """The step over every link of a map with ghost cells, which get no cotangents."""
     return _linear(partial(_rises, neighbours), lambda y: halo(-received(neighbours, y), 0.0), u)
 
 
-def net(neighbours: Neighbours, flux: Fluxes) -> jax.Array:
+def net(neighbours: Neighbours, flux: Fluxes) -> Map:
     """What each cell receives over its links, less what it gives; fluxes are positive towards a link's first cell."""
     return _linear(lambda f: received(neighbours, f), lambda y: tuple(-d for d in _steps(neighbours, y)), tuple(flux))
 
 
-def seen(u: jax.Array, di: int, dj: int) -> jax.Array:
+def seen(u: Ghosted, di: int, dj: int) -> Map:
     """The value di rows and dj columns further, at most one, for each inner cell of a map with ghost cells."""
     return _linear(lambda u: at(u, di, dj), lambda y: _placed(y, (1 + di, 1 - di), (1 + dj, 1 - dj)), u)
 
 
-def inner(u: jax.Array) -> jax.Array:
+def inner(u: Ghosted) -> Map:
     """A map without its ghost cells."""
     return _linear(at, lambda y: halo(y, 0.0), u)
 
 
-def outer(x: jax.Array) -> jax.Array:
+def outer(x: Map) -> Ghosted:
     """A map with ghost cells of 0."""
     return _linear(lambda x: halo(x, 0.0), at, x)
 
 
-def window(x: jax.Array, row: int, column: int, rows: int, columns: int) -> jax.Array:
+def window(x: Map, row: int, column: int, rows: int, columns: int) -> Float[Array, "rows columns ..."]:
     """The part of a map of `rows` x `columns` cells that begins at (row, column)."""
     if (rows, columns) == x.shape[:2]:
         return x
@@ -69,24 +72,24 @@ def window(x: jax.Array, row: int, column: int, rows: int, columns: int) -> jax.
     return _linear(lambda x: x[row : row + rows, column : column + columns], back, x)
 
 
-def put(whole: jax.Array, x: jax.Array, first: int) -> jax.Array:
+def put(whole: Map, x: Float[Array, "rows columns ..."], first: int) -> Map:
     """A map with the part x written into it, `first` rows and columns from its first cell."""
     if x.shape == whole.shape:
         return x
     return lax.dynamic_update_slice(whole, x, (first, first, *(0,) * (x.ndim - 2)))
 
 
-def both_ends(neighbours: Neighbours, u: jax.Array) -> tuple[tuple[jax.Array, jax.Array], ...]:
+def both_ends(neighbours: Neighbours, u: Ghosted) -> tuple[tuple[jax.Array, jax.Array], ...]:
     """The values in the first and the second cell of every link of a map with ghost cells."""
     return _linear(partial(_both_ends, neighbours), partial(_from_both_ends, neighbours), u)
 
 
-def spread(x: jax.Array, like: jax.Array) -> jax.Array:
+def spread(x: Float[Array, "..."], like: Map) -> Map:
     """A value for each map, [] or [B], repeated in every cell of maps shaped `like`; its transpose is `total`."""
     return _linear(lambda x: jnp.broadcast_to(x, like.shape), total, jnp.broadcast_to(x, like.shape[2:]))
 
 
-def total(y: jax.Array) -> jax.Array:
+def total(y: Map) -> Float[Array, "..."]:
     """The sum over the cells of each map.
 
     For small maps it is written out: XLA computes other sums by calls of a library, which cost more than the sum.

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._displacement import Job, whole
@@ -57,7 +58,7 @@ class SplitPush:
 
 
 def push_split(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SplitPush, record: Record | None = None
+    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 2"], push: SplitPush, record: Record | None = None
 ) -> tuple[Pushed, Tree]:
     """Moves the wheel along the legs of `path` [n, 2] (m); see `along_legs`."""
     scene = replace(scene, window=Whole())

@@ -19,6 +19,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
 from jaxsand.interaction._block import Block, Moving, Way
@@ -34,7 +35,7 @@ from jaxsand.scene.window import Window
 
 
 def roll_along(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SteppedPush, record: Record | None = None
+    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 2"], push: SteppedPush, record: Record | None = None
 ) -> tuple[Pushed, Tree]:
     """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
 

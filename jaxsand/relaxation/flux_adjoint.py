@@ -17,11 +17,15 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsand.relaxation.ghost_cells import Bed, halo
 from jaxsand.scene.grid import links
 
-Lattice = tuple[jax.Array, ...]  # a map [H + 1, W + 1] for each direction of links
+Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
+OnLattice = Float[Array, "H+1 W+1"]
+Codes = Int[Array, "H+1 W+1"]
+Lattice = tuple[OnLattice, ...]  # for each direction of links
 _CORNERS = {(0, 1): (0, 1), (1, 0): (0, 2), (1, 1): (0, 3), (1, -1): (1, 2)}
 
 
@@ -30,13 +34,13 @@ def _around(u: jax.Array) -> tuple[jax.Array, ...]:
     return u[:-1, :-1], u[:-1, 1:], u[1:, :-1], u[1:, 1:]
 
 
-def pairs(bed: Bed, u: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+def pairs(bed: Bed, u: Ghosted) -> list[tuple[OnLattice, OnLattice]]:
     """The values in the first and the second cell of every link, for each direction."""
     cells = _around(u)
     return [(cells[_CORNERS[di, dj][0]], cells[_CORNERS[di, dj][1]]) for di, dj, _ in links(bed.neighbours)]
 
 
-def steps(bed: Bed, u: jax.Array) -> Lattice:
+def steps(bed: Bed, u: Ghosted) -> Lattice:
     """The step over every link, from its first to its second cell."""
     return tuple(there - here for here, there in pairs(bed, u))
 
@@ -48,7 +52,7 @@ def stored(flow: list[jax.Array]) -> list[jax.Array]:
     return [both[k * rows : (k + 1) * rows] for k in range(len(flow))]
 
 
-def gains(bed: Bed, flow: Lattice) -> jax.Array:
+def gains(bed: Bed, flow: Lattice) -> Float[Array, "H W"]:
     """What each cell [H, W] gains from fluxes, which are positive towards the links' first cells."""
     net: jax.Array | float = 0.0
     for (di, dj, _), f in zip(links(bed.neighbours), flow, strict=True):
@@ -66,7 +70,7 @@ def yields(bed: Bed) -> Lattice | tuple[jax.Array, ...]:
     return tuple((a + b) * (length / 2) for (a, b), (_, _, length) in zip(both, links(bed.neighbours), strict=True))
 
 
-def active(bed: Bed, s: jax.Array) -> jax.Array:
+def active(bed: Bed, s: Ghosted) -> Codes:
     """Two bits for each link, in the low byte of integers [H + 1, W + 1]: too steep upwards, too steep downwards."""
     code = jnp.zeros((), jnp.int32)
     for k, (d, m) in enumerate(zip(steps(bed, s), yields(bed), strict=True)):
@@ -74,7 +78,7 @@ def active(bed: Bed, s: jax.Array) -> jax.Array:
     return code
 
 
-def opened(bed: Bed, gate: jax.Array | None) -> list[jax.Array | float]:
+def opened(bed: Bed, gate: Ghosted | None) -> list[jax.Array | float]:
     """The part of a surface's excess that flows over each link at rate 1; `gate` is the open share of each cell."""
     lengths: list[jax.Array | float] = [1 / length for _, _, length in links(bed.neighbours)]
     if gate is None:
@@ -82,17 +86,17 @@ def opened(bed: Bed, gate: jax.Array | None) -> list[jax.Array | float]:
     return [jnp.minimum(here, there) * w for (here, there), w in zip(pairs(bed, gate), lengths, strict=True)]
 
 
-def upward(code: jax.Array, link: int) -> jax.Array:
+def upward(code: Codes, link: int) -> Bool[Array, "H+1 W+1"]:
     """Whether a link is too steep upwards; see `active`."""
     return (code & (1 << 2 * link)) != 0
 
 
-def downward(code: jax.Array, link: int) -> jax.Array:
+def downward(code: Codes, link: int) -> Bool[Array, "H+1 W+1"]:
     """Whether a link is too steep downwards; see `active`."""
     return (code & (2 << 2 * link)) != 0
 
 
-def moving(code: jax.Array, link: int) -> jax.Array:
+def moving(code: Codes, link: int) -> Bool[Array, "H+1 W+1"]:
     """Whether a link is too steep to either side; see `active`."""
     return (code & (3 << 2 * link)) != 0
 
@@ -117,7 +121,7 @@ def drop_cotangent(bed: Bed, parts: list[jax.Array]) -> jax.Array:
     return jax.vjp(lambda drop: yields(replace(bed, drop=drop)), bed.drop)[1](tuple(parts))[0]
 
 
-def to_less_open(bed: Bed, gate: jax.Array, parts: list[jax.Array]) -> jax.Array:
+def to_less_open(bed: Bed, gate: Ghosted, parts: list[OnLattice]) -> Ghosted:
     """The cotangent of the open shares [H + 2, W + 2], of which the lesser at each link is the share of the link."""
     net: jax.Array | float = 0.0
     for (di, dj, _), (here, there), part in zip(links(bed.neighbours), pairs(bed, gate), parts, strict=True):
@@ -127,7 +131,7 @@ def to_less_open(bed: Bed, gate: jax.Array, parts: list[jax.Array]) -> jax.Array
     return halo(jnp.asarray(net), 0.0)
 
 
-def total(x: jax.Array) -> jax.Array:
+def total(x: Float[Array, "H W"]) -> Float[Array, ""]:
     """The sum of a map; the rows come first because XLA vectorises that."""
     return jnp.sum(jnp.sum(x, axis=0))
 

@@ -5,11 +5,14 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Plain, Tree, split
 from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
+
+Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
 
 
 @jax.tree_util.register_dataclass
@@ -17,11 +20,11 @@ from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
 class Flow:
     """The size of a sweep: the share of the excess that crosses a straight link, and the quantum of fluxes (m)."""
 
-    rate: jax.Array
-    quantum: jax.Array
+    rate: Float[Array, ""]
+    quantum: Float[Array, ""]
 
 
-def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
     """One sweep of a map with ghost cells [H + 2, W + 2], by forward Euler.
 
     `lost` adds up the height that each cell lost over a draining rim (see `lose`); it is None where the edge is closed.
@@ -36,8 +39,8 @@ def counted(flow: Flow, driven: Fluxes) -> Fluxes:
 
 
 def surge(
-    bed: Bed, flow: Flow, momentum: jax.Array, around: Nothing | Partial, state: tuple[jax.Array, Lost, Fluxes]
-) -> tuple[jax.Array, Lost, Fluxes]:
+    bed: Bed, flow: Flow, momentum: Float[Array, ""], around: Nothing | Partial, state: tuple[Ghosted, Lost, Fluxes]
+) -> tuple[Ghosted, Lost, Fluxes]:
     """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before.
 
     The state is a map with ghost cells, its account of losses, and what links moved last (in quanta).
@@ -50,7 +53,7 @@ def surge(
     return u, lost, moved
 
 
-def apply(bed: Bed, flow: Flow, moved: Fluxes, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def apply(bed: Bed, flow: Flow, moved: Fluxes, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
     """The map with ghost cells after `moved` quanta crossed its links.
 
     `moved` must be stored, behind a barrier, so that both ends of a link use the same number.
@@ -59,7 +62,7 @@ def apply(bed: Bed, flow: Flow, moved: Fluxes, u: jax.Array, lost: Lost) -> tupl
     return halo(h), lost
 
 
-def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"], lost: Lost) -> tuple[Float[Array, "H W"], Lost]:
     """`apply` for a map [H, W] without ghost cells."""
     if lost is not None:
         lost = lose(flow.quantum, lost, moved[-1] * flow.quantum)
