@@ -1,7 +1,11 @@
 """jaxsand: robots that shape sand, simulated in JAX.
 
-A height map settles to its angle of repose after each action of a tool. Names are resolved on first use, so that importing
-the package does not wait for JAX; type checkers and editors see them all.
+`make_scene` describes the sand and the tool, `settle` lets a height map flow to its angle of repose, `step` pushes the tool
+along a straight stroke and lets the sand settle, and `follow` pushes along a path. All are pure functions of arrays, to be
+transformed by `jax.jit`, `jax.vmap` and `jax.grad`.
+
+Lengths are metres and angles radians. Cell [i, j] of a height map is centred at x = (j + 1/2) dx, y = (i + 1/2) dx, dx the
+spacing. Names are imported on first use, so that `import jaxsand` does not wait for JAX.
 """
 
 from importlib import import_module, metadata
@@ -146,6 +150,7 @@ _OTHER_NAMES = ("env", "forces", "gym", "task", "trench")  # modules
 
 
 def __getattr__(name: str) -> Any:
+    """The public object of this name, imported now."""
     if name == "__version__":
         return metadata.version("jaxsand")
     if name in _OTHER_NAMES:

@@ -1,4 +1,4 @@
-"""The examples in the docstrings of public names give what they say."""
+"""The examples in the docstrings of public names, and of the loop that all is built on, give what they say."""
 
 import doctest
 import inspect
@@ -8,8 +8,10 @@ import jax
 import pytest
 
 import jaxsand as js
+from jaxsand.autodiff.while_loop import repeat_until
 
-NAMES = sorted(name for name in js.__all__ if inspect.isroutine(getattr(js, name)) or inspect.isclass(getattr(js, name)))
+PUBLIC = {name: getattr(js, name) for name in sorted(js.__all__)}
+EXAMPLES = {name: obj for name, obj in PUBLIC.items() if inspect.isroutine(obj) or inspect.isclass(obj)}
 
 
 @pytest.fixture(autouse=True)
@@ -31,9 +33,9 @@ def run(name: str, obj: object) -> tuple[int, str]:
     return sum(len(test.examples) for test in tests), "".join(report)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*EXAMPLES, "repeat_until"])
 def test_the_example_runs(name):
-    examples, report = run(name, getattr(js, name))
+    examples, report = run(name, EXAMPLES.get(name, repeat_until))
     assert examples, f"{name} has no example"
     assert not report, report
 

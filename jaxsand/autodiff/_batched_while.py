@@ -1,11 +1,11 @@
-"""Loops of a batch of maps in lockstep, each until it is done: how while_loop.py runs under `vmap`.
+"""The loops of while_loop.py under `vmap`: the maps of a batch run in lockstep, each until it is done.
 
-The step's number is one number, not one for each map, and the tape that reverse mode reads is written in place.
+All maps share one step number, so that the tape for reverse mode can be written in place.
 
-A step may say that it computes a batch by itself (`Step.trailing`): then `vmap` moves the batch to the last axis of all
-arrays, the vector unit's lanes, where it stays for the whole loop, and on a CPU takes no more maps at a time than a core's
-cache holds, those of like `work` together. Such a step leaves a map that is ready as it is, and its `done` speaks for all
-maps at once.
+A step whose attribute `trailing` is true computes a batch by itself. `vmap` then moves the batch to the last axis of all
+arrays, the lanes of the vector unit, for the whole loop. On a CPU it takes no more maps at a time than a core's cache holds,
+and runs maps of like `work` together.
+Such a step must not change a map that is done, and its `done` returns one boolean for all maps.
 """
 
 from collections.abc import Callable
@@ -19,57 +19,58 @@ from jax.custom_batching import custom_vmap
 
 Tree = Any
 Done = Callable[[Tree, jax.Array, Tree], jax.Array]
-KEPT = 8  # states of a long loop that the forward pass keeps for reverse mode; then every other one is dropped
-SPARE = 2  # and room for so many more, which are restored between them
+KEPT = 8  # states of a long loop that the forward pass keeps for reverse mode; when full, it drops every other one
+SPARE = 2  # further states that reverse mode may keep between them
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """A loop over `lanes` leading axes of the state in lockstep."""
+    """A loop whose state has `lanes` leading batch axes, run in lockstep; `width` is the size of a trailing batch, or 0."""
 
     done: Done | None
     step: Any
     bound: int
     lanes: int
-    width: int = 0  # maps in the last axis
+    width: int = 0
 
     @property
     def trailing(self) -> bool:
-        """Whether the step computes maps in the last axis of everything."""
+        """Whether the step computes a batch in the last axis of all arrays."""
         return getattr(self.step, "trailing", False)
 
     @property
     def room(self) -> int:
-        """How many records the tape holds."""
+        """The number of records that the tape holds."""
         return max(1, min(self.bound, self.step.tape))
 
     def over(self, axes: Tree) -> "Lanes":
-        """The loop over one more leading axis of the state and of those params whose axis is 0."""
+        """The loop with one more leading batch axis: of the state, and of the params whose entry in `axes` is 0."""
         done = None if self.done is None else jax.vmap(self.done, in_axes=(axes, None, 0))
         return Lanes(done, _Many(self.step, axes), self.bound, self.lanes + 1)
 
     def ready(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
+        """Which lanes stop before step k."""
         over = k >= self.bound
         return over if self.done is None else over | self.done(params, k, state)
 
     def taken(self, count: jax.Array) -> jax.Array | None:
-        """What is said of the number of steps; nothing where that is known."""
+        """The number of steps of each map, or None where it is the bound."""
         return None if self.done is None else self.said(count)
 
     def said(self, number: jax.Array) -> jax.Array:
-        """What is one and the same for all maps, said of each."""
+        """A number that all maps share, repeated for each map of a trailing batch."""
         return jnp.broadcast_to(number[..., None], (*number.shape, self.width)) if self.width else number
 
     def total(self, count: jax.Array | None) -> jax.Array:
-        """The largest number of steps in any lane."""
+        """The largest number of steps of any map."""
         return jnp.int32(self.bound) if count is None else jnp.max(count)
 
     def beyond(self, k: jax.Array, count: jax.Array | None) -> jax.Array:
-        """The lanes in which step k was not taken."""
+        """The lanes that had stopped before step k."""
         return jnp.zeros((), bool) if count is None else k >= count
 
     def keep(self, ready: jax.Array, old: Tree, new: Tree) -> Tree:
-        """The old state in the lanes that are ready."""
+        """The old state in the lanes that are ready, the new one in the others."""
         if not self.lanes or not ready.ndim:
             return new
         return jax.tree.map(
@@ -77,12 +78,16 @@ class Lanes:
         )
 
     def put(self, tape: Tree, k: jax.Array, record: Tree) -> Tree:
+        """The tape with the record in place k."""
         return jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, k, self.lanes), tape, record)
 
     def get(self, tape: Tree, k: jax.Array) -> Tree:
+        """The record in place k of the tape."""
         return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, k, self.lanes, keepdims=False), tape)
 
     def blank(self, n: int, record: Tree) -> Tree:
+        """A tape of n records of zeros."""
+
         def zeros(x: jax.Array) -> jax.Array:
             return jnp.zeros((*x.shape[: self.lanes], n, *x.shape[self.lanes :]), x.dtype)
 
@@ -90,7 +95,7 @@ class Lanes:
 
 
 class _Many:
-    """A step over one more leading axis."""
+    """A step with one more leading batch axis."""
 
     def __init__(self, step: Any, axes: Tree) -> None:
         self.tape = step.tape
@@ -104,7 +109,7 @@ class _Many:
 
 
 def batched(program: Callable[..., Any], loop: Lanes, params: Tree, *rest: Tree) -> Tree:
-    """`program(loop, params, *rest)`, which under `vmap` is the program over one more lane; all of `rest` gains the axis."""
+    """`program(loop, params, *rest)`; under `vmap` the same program with one more batch axis, which all of `rest` gains."""
 
     @custom_vmap
     def run(params: Tree, rest: Tree) -> Tree:
@@ -124,7 +129,7 @@ def batched(program: Callable[..., Any], loop: Lanes, params: Tree, *rest: Tree)
 
 
 def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[Any], args: Tree) -> Tree:
-    """`program` with one more batch in the last axis, chunk by chunk; the result gains the axis in front.
+    """`program` with one more batch in the last axis, chunk by chunk; in the result the batch axis is the first.
 
     A chunk takes as many steps as its longest map, so maps are sorted by their work.
     """
@@ -167,7 +172,7 @@ def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[
 
 
 def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
-    """The state at the end, and the steps that took."""
+    """Runs the loop: the last state, and the number of steps."""
 
     def advance(carry: Tree) -> Tree:
         state, k, count, ready = carry
@@ -184,7 +189,10 @@ def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
 
 
 def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
-    """`run`, with the records of the last steps and, where there may be more of them, some of the states before."""
+    """Runs the loop for reverse mode: the last state, the number of steps, the tape, and some earlier states.
+
+    The tape holds the records of the last `loop.room` steps. States are kept only where there may be more steps than that.
+    """
 
     def advance(carry: Tree) -> Tree:
         state, k, count, ready, tape = carry
@@ -224,6 +232,8 @@ def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tr
 
 
 def push(loop: Lanes, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
+    """The jvp of the loop: the tangent of the last state. Computes the steps again."""
+
     def push(k: jax.Array, carry: Tree) -> Tree:
         x, dx = carry
         new, record = loop.step.recorded(params, k, x)
@@ -234,10 +244,10 @@ def push(loop: Lanes, params: Tree, state: Tree, count: jax.Array, dparams: Tree
 
 
 def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
-    """The cotangents of params and of the state at the start, from the end backwards.
+    """The vjp of the loop: the cotangents of params and of the first state, computed from the last step backwards.
 
-    Records that are no longer on the tape are restored from the last state kept before them; where that lies far back, a
-    state halfway is kept first, as long as there is room for one.
+    Records that are no longer on the tape are computed anew from the last state kept before them. Where that state lies far
+    back, a state halfway is kept first, as long as there is room for one.
     """
     total = loop.total(count)
 

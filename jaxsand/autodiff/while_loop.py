@@ -1,14 +1,14 @@
-"""A bounded while loop that can be differentiated in reverse and in forward mode.
+"""A bounded while loop that can be differentiated in forward and in reverse mode.
 
-`lax.while_loop` stops as soon as the work is done but has no reverse mode; `lax.scan` has one but always runs its full
-length. Settling and pushing need both, so this loop runs a `while_loop` forwards and is differentiated as the fixed number
-of steps that it turned out to take. What a step leaves on a tape for its derivative is up to the step.
+`lax.while_loop` stops as soon as the work is done but has no reverse mode. `lax.scan` has one but always runs its full
+length. Settling and pushing need both. So this loop runs a `while_loop` forwards, and differentiates the number of steps
+that it took. Each step decides what it records on a tape for its derivative.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,34 +17,42 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxsand.autodiff import _batched_while as lockstep
-from jaxsand.autodiff._batched_while import Done, Tree
+from jaxsand.autodiff._batched_while import Done
+
+Tree: TypeAlias = lockstep.Tree
 
 
 class Step(Protocol):
-    """One step of a loop, and its derivative by what it left on the tape.
+    """One step of a loop, with its jvp and vjp.
 
-    All of these are pure, and none closes over traced values.
+    All methods are pure, and none may close over traced values. `params` is a pytree that is the same in all steps, `k` the
+    number of the step from 0, and `state` a pytree of floats.
     """
 
     @property
     def tape(self) -> int:
-        """How many records are kept at hand; of a longer loop the earlier ones are restored."""
+        """The number of records that reverse mode keeps; it computes the earlier records of a longer loop anew."""
 
     def __call__(self, params: Tree, k: jax.Array, state: Tree, /) -> Tree: ...
 
     def recorded(self, params: Tree, k: jax.Array, state: Tree, /) -> tuple[Tree, Tree]:
-        """The state after step k, and what its derivative needs."""
+        """The state after step k, and a record of what the derivatives of the step need."""
 
     def push(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree, /) -> Tree:
-        """The tangent of the state after the step."""
+        """The jvp: the tangent of the state after step k, from those of params and of the state before."""
 
     def pull(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree, /) -> tuple[Tree, Tree]:
-        """The cotangents of params and of the state before the step."""
+        """The vjp: the cotangents of params and of the state before step k, from that of the state after."""
 
 
 @dataclass(frozen=True)
 class Plain:
-    """A step that leaves the state before it on the tape, and is differentiated there by JAX."""
+    """A step that records the state before it, and is differentiated by JAX.
+
+    Args:
+        body: the step as a function of params, k and the state.
+        tape: number of records that reverse mode keeps.
+    """
 
     body: Callable[[Tree, jax.Array, Tree], Tree]
     tape: int = 16
@@ -65,7 +73,7 @@ class Plain:
 
 
 def split(params: Tree) -> tuple[tuple[jax.Array, ...], Callable[[Tree], Tree]]:
-    """The floats of a tree, which tangents belong to, and how to put them back."""
+    """The floating-point leaves of a tree, and a function that puts such leaves back into the tree."""
     leaves, treedef = jax.tree.flatten(params)
     inexact = [bool(jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)) for leaf in leaves]
 
@@ -77,21 +85,45 @@ def split(params: Tree) -> tuple[tuple[jax.Array, ...], Callable[[Tree], Tree]]:
 
 
 def repeat(step: Step, count: int, params: Tree, state: Tree) -> Tree:
-    """Repeats `state = step(params, k, state)` for k = 0 to `count` - 1; differentiable like `repeat_until`."""
+    """Repeats `state = step(params, k, state)` for k = 0 to `count` - 1 and returns the last state.
+
+    Differentiable like `repeat_until`.
+    """
     return _loop(lockstep.Lanes(None, step, count, 0), params, state)[0]
 
 
 def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) -> tuple[Tree, jax.Array]:
     """Repeats `state = step(params, k, state)` for k = 0, 1, ... until `done(params, k, state)` or k = `bound`.
 
-    `state` is a tree of floats; `params` is any tree of arrays. Neither function may close over traced values. Returns the
-    last state and the number of steps taken.
+    Differentiable once, in forward and reverse mode, with respect to the floats of `params` and `state`; the number of steps
+    is held fixed. Forward mode computes the steps a second time. Reverse mode keeps the records of the last `step.tape`
+    steps and up to `lockstep.KEPT` states, whatever the bound. From these states it computes the earlier records of a longer
+    loop, at the cost of about one forward pass, and half of one for each doubling beyond `KEPT` tapes.
 
-    Differentiable once, in both modes, with respect to the floats of `params` and `state`, the number of steps held fixed.
-    Forward mode repeats the primal steps. Reverse mode keeps what the last `step.tape` steps recorded and, whatever the
-    bound, up to `lockstep.KEPT` states; from these it restores the earlier records of longer loops, which costs about one
-    more forward pass, and half of one more for each doubling beyond `KEPT` tapes. A second derivative raises
-    NotImplementedError.
+    Args:
+        done: whether to stop before step k; a function of params, k and the state that closes over no traced value.
+        step: the step.
+        bound: largest number of steps.
+        params: pytree of arrays.
+        state: pytree of floats, the state before the first step.
+
+    Returns:
+        The last state, and the number of steps taken.
+
+    Raises:
+        NotImplementedError: a second derivative is asked for.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> from jaxsand.autodiff.while_loop import Plain, repeat_until
+        >>> halve = Plain(lambda factor, k, x: factor * x)
+        >>> small = lambda factor, k, x: x < 1
+        >>> x, steps = repeat_until(small, halve, 100, jnp.float32(0.5), jnp.float32(6.0))
+        >>> print(x, steps)
+        0.75 3
+        >>> jax.grad(lambda x: repeat_until(small, halve, 100, jnp.float32(0.5), x)[0])(6.0).item()
+        0.125
     """
     return _loop(lockstep.Lanes(done, step, bound, 0), params, state)
 
@@ -114,12 +146,12 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
     # One flat vector, so that vmap sees a single operand that is batched or not.
     start, unravel = ravel_pytree((dparams, dstate))
 
-    def forward(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
+    def forward(_: object, vector: jax.Array) -> jax.Array:
         df, dx = unravel(vector)
         params, state, *_ = shown(kept)
         return ravel_pytree((df, lockstep.batched(lockstep.push, loop, params, state, count, df, dx)))[0]
 
-    def backward(_: Callable[..., Any], vector: jax.Array) -> jax.Array:
+    def backward(_: object, vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
         params, _, tape, saved = shown(kept)
         df, dx = lockstep.batched(lockstep.pull, loop, params, count, tape, saved, cx)
@@ -131,10 +163,10 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
 
 
 def hidden(tree: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:
-    """The bits of a tree's floats as whole numbers, and how to get them back, which costs nothing within a program.
+    """The bits of a tree's floats as integers, and a function that turns them back into floats.
 
-    What a derivative keeps leaves the program that computes it, and `jax_debug_nans` would take the NaN of cells without
-    sand (ghost_cells.py) for a fault.
+    Saved values leave the compiled program that computes them, where `jax_debug_nans` would report the NaN that marks cells
+    without sand (ghost_cells.py). The conversion costs nothing.
     """
     types = jax.tree.map(jnp.result_type, tree)
 
@@ -150,7 +182,7 @@ def hidden(tree: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:
 
 @jax.custom_jvp
 def first_order(tree: Tree) -> Tree:
-    """The same; what is differentiated through it cannot be differentiated again."""
+    """The tree itself; differentiating its derivative again raises NotImplementedError."""
     return tree
 
 

@@ -1,14 +1,14 @@
-"""What a blade does to the sand in a block around it: it clears what it newly covers, and keeps what is ahead of it there.
+"""A blade in a block of sand: displacement from the cells that it newly covers, and links that it closes.
 
-A blade stands in the sand as a prism over its footprint, from its bottom up. Where it covers the share a of a cell, that
+A blade stands in the sand as a prism over its footprint, from its bottom up. Where it covers the share a of a cell, the
 cell's sand above the bottom lies in the open share 1 - a. Whenever a grows to b, the share (b - a) / (1 - a) of that sand
-has to leave. It goes one cell on along the face's normal, to the one or two of the eight neighbours that lie there, shared
-as the normal divides the angle between them; where no cell is there (a wall, a closed edge, a rim above the sand) it stays
-in its column, inside the blade, and flows off when the blade has gone.
+has to leave. It moves one cell on along the normal of the face, to the one or two of the eight neighbours that lie there,
+divided between them by angle. Where no cell is there (a wall, a closed edge, a rim above the sand), it stays in its cell,
+inside the blade, and flows off when the blade has gone.
 
-A blade is a wall. Its middle plane, as wide as it is, cuts every link whose ends lie on its two sides; a cell through whose
-centre the plane passes is covered to the plane's own share, since a blade is at least a cell thick. So no link between front
-and rear is ever open, and how open the others are is continuous in the pose.
+A blade also closes links. Its middle plane, as wide as the blade, cuts every link whose ends lie on its two sides. A blade
+is at least a cell thick, so that a cell through whose centre the plane passes is covered to the plane's own share. Hence no
+link between front and rear is ever open, and the open shares of the others are continuous in the pose.
 """
 
 from dataclasses import dataclass
@@ -24,16 +24,23 @@ from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.grid import Neighbours
 
 _LEAST = 1e-4
-SLIVER = 0.02  # in an open share below this sand stands no higher than it would in this one
-_LEAVES = 0.125  # spacings: sand inside of the blade has left once it has moved so far
+SLIVER = 0.02  # the smallest open share that is divided by: in a narrower one sand stands as high as in this
+_LEAVES = 0.125  # spacings that the blade moves until sand inside it has left
 Shares = dict[tuple[int, int], jax.Array]
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Which share of each cell a blade covers before and after it moves, and at any time on the way; the share of each
-    that lies between its ends, `beside`; and `along`, how far ahead of its middle plane the cell is afterwards. All in a
-    block's halo, and so is how far it moves, `gone` (spacings)."""
+    """The footprints of a blade that moves; all are maps of a block with ghost cells.
+
+    Attributes:
+        before: share of each cell that the blade covers before it moves.
+        swept: share that it covers at any time on the way.
+        after: share that it covers afterwards.
+        beside: share that lies between the blade's two ends, afterwards.
+        along: distance of each cell from the blade's middle plane afterwards, positive ahead (spacings).
+        gone: distance by which the blade moves at each cell (spacings).
+    """
 
     before: jax.Array
     swept: jax.Array
@@ -53,10 +60,10 @@ def _to(s: jax.Array) -> jax.Array:
 
 
 def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Array) -> Reach:
-    """A blade of half the thickness `half` (spacings) that moves ahead.
+    """The footprints of a blade of half the thickness `half` (spacings) that moves straight ahead.
 
-    What it covers is the product of two intervals, along and across, each smoothed over one spacing: exact for headings
-    along the grid, a first-order approximation otherwise; continuous and piecewise linear.
+    A footprint is the product of two intervals, along and across, each smoothed over one spacing: exact for headings along
+    the grid, a first-order approximation otherwise. It is continuous and piecewise linear.
     """
     rear, front, front_after = _to(along + half), _to(along - half), _to(along - half - ahead)
     after = _to(along + half - ahead) - front_after
@@ -67,7 +74,10 @@ def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Ar
 def turned(
     old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Array], half: jax.Array, side: jax.Array, angle: jax.Array
 ) -> Reach:
-    """A blade that turns in place by a small `angle`, from coordinates (along, across) `old` of the cells to `new`."""
+    """The footprints of a blade that turns in place by a small `angle` (rad).
+
+    The coordinates (along, across) of the cells in the blade's frame change from `old` to `new`.
+    """
     ahead, way = jnp.abs(old[1] * angle), facing(old[1], angle)
     beside, beside_after = share(old[1], -side, side), share(new[1], -side, side)
     after = beside_after * share(new[0], -half, half)
@@ -76,14 +86,16 @@ def turned(
 
 
 def facing(across: jax.Array, angle: jax.Array) -> jax.Array:
-    """To which side a cell beside the centre is pushed by a turn: 1 ahead, -1 back."""
+    """The side to which a turn moves the blade at a cell beside its centre: 1 ahead, -1 back."""
     return jnp.where(across * angle > 0, -1.0, 1.0).astype(across.dtype)
 
 
 def cleared(reach: Reach, h: jax.Array, bottom: jax.Array) -> jax.Array:
-    """The sand that has to leave the cells of a block, in whole quanta; ahead of the middle plane also what is still inside
-    of the blade, in cells that it all but fills, at a pace that does not depend on the number of sub-steps: sand flows into
-    a sliver again, so that emptying it at once at each of them would pump."""
+    """The sand that has to leave the cells of a block, in whole quanta.
+
+    Ahead of the middle plane, sand that is still inside the blade leaves as well, from cells that the blade almost fills. It
+    leaves over a fixed distance: sand flows back into such cells, and emptying them in each sub-step would pump.
+    """
     before, swept, along = inner(reach.before), inner(reach.swept), inner(reach.along)
     grown = swept > before
     part = jnp.where(grown, (swept - before) / jnp.where(grown, 1 - before, 1), 0)
@@ -93,13 +105,12 @@ def cleared(reach: Reach, h: jax.Array, bottom: jax.Array) -> jax.Array:
 
 
 def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.Array, Fluxes]:
-    """The open share of each cell, and how open each link is, with the blade where it stands in the end; `holds` is 1 where
-    a cell can hold sand, in a halo.
+    """The open share of each cell and of each link, after the blade has moved; `holds` is 1 for cells that can hold sand.
 
-    A link is as open as the narrower of its cells, times 2 / (1 + narrower / wider), and no more than the blade's middle
-    plane leaves of it where that cuts it.
+    A link is as open as the narrower of its two cells, times 2 / (1 + narrower / wider). Where the blade's middle plane cuts
+    the link, the narrower counts at most as what the plane leaves open. Maps of cells have ghost cells.
     """
-    # In a halo of its own the cover is stored, lest XLA compute it anew for both ends of every link.
+    # New ghost cells store the footprint, which XLA would else compute anew for both ends of every link.
     free = (1 - outer(inner(reach.after))) * holds
     out = []
     of_links = (both_ends(neighbours, x) for x in (free, lax.stop_gradient(reach.along), reach.beside))
@@ -112,10 +123,11 @@ def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.A
 
 
 def onward(cos: jax.Array, sin: jax.Array, room: jax.Array) -> Shares:
-    """The shares of neighbours for a direction in the first octant, cos and sin of [m, m]: across, and across and up.
+    """The shares of the neighbours for displacement along (cos, sin), a direction between +x and the diagonal.
 
-    `room` is 1 in a halo where sand can go. Where one of the two has none the other takes all; where neither has, sand
-    slides up along what is in its way, the more the more the direction leads there.
+    They go to the neighbour along x and to the diagonal one. `room`, with ghost cells, is 1 where sand can go. Where one of
+    the two has no room, the other takes all. Where neither has, sand slides along y, the more the closer the direction is to
+    the diagonal.
     """
     ahead, aslant = (cos - sin) / cos, sin / cos
     here, there, up = at(room, 0, 1), at(room, 1, 1), at(room, 1, 0)
@@ -130,17 +142,17 @@ def onward(cos: jax.Array, sin: jax.Array, room: jax.Array) -> Shares:
 
 
 def any_way(p: jax.Array, q: jax.Array) -> Shares:
-    """The shares of the eight neighbours for directions (p across, q up) of largest component 1 or less; see `shares`."""
+    """The shares of the eight neighbours for displacement along (p, q), |p| and |q| at most 1; see `shares`."""
     return dict(zip(EIGHT, shares(p, q), strict=True))
 
 
 def handed_on(
     parts: Shares, holds: jax.Array, carried: jax.Array, over: tuple[jax.Array, jax.Array] | None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """What stays of `carried` quanta, what cells receive, and what is lost over a rim.
+    """Moves `carried` quanta to neighbours by the shares `parts`: what stays in each cell, what each receives, what is lost.
 
-    `holds` is 1 where a cell can take some, in a halo. `over` tells where in the halo there is nothing but a rim, and how
-    much of what is carried may pass over that; the rest stays.
+    `holds`, with ghost cells, is 1 where a cell can take sand. `over` is None where the edge is closed; else it holds the
+    ghost cells beyond a rim, and how much of what each cell carries may pass over the rim. The rest stays.
     """
     kept, got, lost = carried, jnp.zeros_like(carried), None if over is None else jnp.zeros_like(carried)
     source = outer(carried)

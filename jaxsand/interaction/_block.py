@@ -1,4 +1,4 @@
-"""A leg of a blade in a block of the map around it: what goes with it, and how the block is fetched and set back."""
+"""The block of the map around a tool: how it is read and written back, and how the sand in it stands."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,33 +16,53 @@ from jaxsand.relaxation.ghost_cells import Lost, at, halo, lose, nearest
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.tools import Pose
 
-SPARE = 1  # cells: the margin of a block in which sand must not move, for then none beyond would have
-_CELLS = 8_192  # of all maps that are pushed together: what a sub-step needs of them stays in a core's cache
+SPARE = 1  # width of a block's margin in cells: if no sand moves in it, none would have moved beyond
+_CELLS = 8_192  # cells of all maps that are pushed together, whose sub-step then works in a core's cache
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Way:
-    """A leg of a blade on a map, lengths along the ground in spacings, heights in m; numbers, or [B] each for a batch."""
+    """A leg of a blade: horizontal lengths in spacings, heights in m. Values are scalars, or [B] each for a batch.
+
+    Attributes:
+        start: the blade's pose at the start.
+        length: length of the leg.
+        half: half of the blade's thickness.
+        side: half of the blade's width.
+        bottom: height of the blade's bottom.
+        spacing: the grid's spacing (m).
+        quantum: quantum of heights.
+        drop: largest stable step, a scalar or a flat map [cells].
+        level: height of a draining rim, or None.
+        rate: rate of the proximal steps.
+        angle: angle by which the blade turns in place before the leg (rad).
+    """
 
     start: Pose
     length: jax.Array
-    half: jax.Array  # of the thickness
-    side: jax.Array  # half of the width
+    half: jax.Array
+    side: jax.Array
     bottom: jax.Array
     spacing: jax.Array
     quantum: jax.Array
-    drop: jax.Array  # [], or a flat map [cells]
-    level: jax.Array | None  # of a rim
+    drop: jax.Array
+    level: jax.Array | None
     rate: jax.Array
-    angle: jax.Array  # by which the blade turned to get here
+    angle: jax.Array
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Moving:
-    """Sand on its way: flat maps [cells] of heights (m) and of what was lost, the last fluxes in the block around the blade
-    (quanta), and how far sand moved at the block's edge (spacings)."""
+    """The state of a leg.
+
+    Attributes:
+        height: flat map [cells] of heights (m), NaN where there is no sand.
+        lost: account of what drained, flat maps; see `ghost_cells.lose`.
+        flux: fluxes of the last sub-step in the block around the blade (quanta).
+        edge: largest change of height at the block's edge so far (spacings).
+    """
 
     height: jax.Array
     lost: Lost
@@ -53,9 +73,15 @@ class Moving:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class View:
-    """A block of the map, [m, m]: where its cells lie; which hold sand (1 or 0, in a halo); the largest stable step
-    (quanta); over how many sides a cell drains; and, in a halo, what lies beyond a rim. The last two are None where nothing
-    drains."""
+    """A block of the map, [m, m], apart from its heights.
+
+    Attributes:
+        where: where its cells lie on the map.
+        holds: 1 for cells with sand, else 0; with ghost cells.
+        drop: largest stable step (quanta).
+        sides: number of sides over which each cell drains, or None where the edge is closed.
+        beyond: 1 for cells beyond a rim, with ghost cells, or None where the edge is closed.
+    """
 
     where: Places
     holds: jax.Array
@@ -67,7 +93,8 @@ class View:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Stand:
-    """How open links and cells are, and how much higher sand stands in them for it."""
+    """How sand stands around a tool: the open share of links (`gates`) and of cells (`open`), and how much higher sand
+    stands in partly covered cells (`stretch`); see resting.py."""
 
     gates: Fluxes
     open: jax.Array
@@ -79,9 +106,15 @@ First = tuple[jax.Array, jax.Array]
 
 @dataclass(frozen=True)
 class Block:
-    """Which part of a map [H, W] is computed: a block of `size` squared that follows the blade, or one that holds it all.
+    """The part of a map that is computed, of `size` x `size` cells.
 
-    All that the blade covers or touches lies in a part of the block, `near` squared, around where the blade is.
+    Attributes:
+        shape: rows and columns of the map.
+        size: cells along a side of the block.
+        near: cells along a side of the inner part that holds all that the blade covers or touches.
+        follows: whether the block follows the blade; else it holds the whole map.
+        neighbours: 4, 8 or "isotropic".
+        drains: whether the map's edge drains.
     """
 
     shape: tuple[int, int]
@@ -93,11 +126,11 @@ class Block:
 
     @property
     def before(self) -> int:
-        """How many rows and columns of the block lie before the part that is near."""
+        """The number of rows and columns of the block before its inner part."""
         return (self.size - self.near) // 2
 
     def corner(self, x: jax.Array, y: jax.Array) -> First:
-        """The first cell of the block around (x, y), across and up; the block may hang over the map."""
+        """The column and row of the first cell of the block around (x, y); it may lie off the map."""
         if not self.follows:
             zero = jnp.zeros_like(x).astype(jnp.int32)
             return zero, zero
@@ -106,12 +139,10 @@ class Block:
         return begin[0], begin[1]
 
     def ahead(self, frame: Frame, length: jax.Array, step: jax.Array, stride: float) -> tuple[First, First]:
-        """Where the block begins around the middle of a step of `stride` spacings along a leg, and by how much that has
-        moved since the step before.
+        """The first cell of the block around the middle of a step of `stride` spacings, and its change since the last step.
 
-        The two places are computed as one array. As two expressions a compiler may join products and sums in one and not in
-        the other, and what is the new place now is the old one a step later: where a middle is on the border of two cells,
-        once in a hundred thousand strokes, the block would have been elsewhere than remembered.
+        Both places are computed as one array. In two expressions a compiler may round differently, and then, once in a
+        hundred thousand strokes, the new place of one step would not be the old place of the next.
         """
         steps = jnp.maximum(jnp.stack([step - 1, step]), 0).astype(length.dtype)
         ways = jnp.minimum((steps.reshape(2, *(1,) * length.ndim) + 0.5) * stride, length)
@@ -120,7 +151,7 @@ class Block:
         return (x[1], y[1]), (x[1] - x[0], y[1] - y[0])
 
     def coordinates(self, frame: Frame, first: First) -> tuple[jax.Array, jax.Array]:
-        """How far ahead of a pose, and to its left, the cells that are near it, and a halo, lie (spacings)."""
+        """How far ahead of a pose, and to its left, the inner part's cells and ghost cells lie (spacings)."""
         size = self.near + 2
         like = jnp.zeros((size, size, *frame.pose.x.shape), frame.pose.x.dtype)
         pose = jax.tree.map(lambda x: spread(x, like), frame.pose)
@@ -129,21 +160,21 @@ class Block:
         return x * pose.cos + y * pose.sin, y * pose.cos - x * pose.sin
 
     def part(self, x: jax.Array) -> jax.Array:
-        """The part of a map that is near the blade; of one with halo, with a halo; of links, the links of its cells."""
+        """The inner part of a map of the block: with ghost cells if the map has them, and of fluxes those of its cells."""
         rows, columns = (self.near + n - self.size for n in x.shape[:2])
         return window(x, self.before, self.before, rows, columns)
 
     def put(self, whole: jax.Array, part: jax.Array) -> jax.Array:
-        """A map with the part replaced that is near the blade."""
+        """A map of the block with its inner part replaced."""
         return put(whole, part, self.before)
 
     @property
     def together(self) -> int:
-        """How many maps to push at a time."""
+        """The number of maps of a batch that are pushed at a time."""
         return max(16, _CELLS // self.size**2 // 16 * 16) if jax.default_backend() == "cpu" else 1 << 30
 
     def view(self, way: Way, frame: Frame, first: First, flat: jax.Array) -> tuple[View, jax.Array]:
-        """The block that begins at `first`, and its heights (quanta)."""
+        """The block whose first cell is `first`, and its heights (quanta, 0 where there is no sand)."""
         where = places(frame, self.size, first)
         h = cut(where, flat) / way.quantum
         solid = jnp.isnan(h)
@@ -158,11 +189,11 @@ class Block:
         return view, jnp.where(solid, 0, h)
 
     def back(self, way: Way, view: View, flat: jax.Array, h: jax.Array) -> jax.Array:
-        """The flat map with the block's heights (quanta) put back."""
+        """The flat map (m) with the block's heights (quanta) written back."""
         return paste(view.where, flat, jnp.where(at(view.holds) > 0, h * way.quantum, jnp.nan))
 
     def lose(self, way: Way, view: View, lost: Lost, amount: jax.Array | None) -> Lost:
-        """Adds what a block lost (quanta) to the account."""
+        """The account of losses after the block lost an amount (quanta)."""
         if lost is None or amount is None:
             return lost
         block = (cut(view.where, lost[0], 0.0), cut(view.where, lost[1], 0.0))
@@ -170,8 +201,10 @@ class Block:
         return paste(view.where, lost[0], low), paste(view.where, lost[1], high)
 
     def touched(self, way: Way, frame: Frame, first: First, old: jax.Array, new: jax.Array, cover: jax.Array) -> jax.Array:
-        """How far sand moved (spacings) in the outermost cells of a block where its edge is not the map's; infinite where
-        the blade covers a part of it, `cover` of what is near."""
+        """The largest change of height (spacings) in the block's outermost cells, along edges that are not the map's.
+
+        It is infinite if the blade's footprint `cover`, a map of the inner part, covers one of them.
+        """
         if not self.follows:
             return jnp.zeros_like(way.length)
         near: Any = False
@@ -188,28 +221,30 @@ class Block:
         return Stand(gates, at(view.holds), jnp.zeros_like(at(view.holds)))
 
     def around(self, view: View, reach: blade.Reach) -> Stand:
-        """How sand stands near a blade."""
+        """How sand stands in the inner part, around a blade."""
         free, gates = blade.gates(self.neighbours, reach, self.part(view.holds))
         free = inner(free)
         return Stand(gates, free, (1 - free) / jnp.maximum(free, blade.SLIVER) * at(self.part(view.holds)))
 
     def sand(self, way: Way, view: View, clear: Stand, near: Stand) -> Sand:
-        """The sand of the block around a blade, `near` which it stands as told."""
+        """The sand of the block: `clear` gives how it stands without a blade, and `near` how in the inner part."""
         stand = jax.tree.map(self.put, clear, near)
         rim = None if way.level is None else way.level / way.quantum
         bottom = way.bottom / way.quantum
         return Sand(stand.gates, stand.open, stand.stretch, bottom, view.drop, view.sides, rim, self.neighbours)
 
     def guess(self, gates: Fluxes, part: jax.Array, flux: Fluxes) -> Fluxes:
-        """A part of the last fluxes, as far as links are open, `gates` of those near the tool; none of what ran off over a
-        rim, which would not come back."""
+        """The fluxes from which a sub-step starts: the share `part` of the last ones, less over links that are closing.
+
+        `gates` are the open shares of links in the inner part. The loss over a rim starts at 0, since it cannot come back.
+        """
         links = tuple(nearest(f * part) for f in flux[: len(flux) - int(self.drains)])
         there = where_open(self.neighbours, gates, tuple(self.part(f) for f in links))
         over = (jnp.zeros_like(f) for f in flux[len(links) :])
         return (*(self.put(f, g) for f, g in zip(links, there, strict=True)), *over)
 
     def over(self, way: Way, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array] | None:
-        """What lies beyond a rim near the blade, and which part of the sand above its bottom stands above the rim."""
+        """The inner part's cells beyond a rim, and the share of sand above the tool's bottom that is above the rim too."""
         if view.beyond is None or way.level is None:
             return None
         bottom, level = way.bottom / way.quantum, way.level / way.quantum
@@ -219,7 +254,7 @@ class Block:
     def displaced(
         self, way: Way, view: View, shares: blade.Shares, h: jax.Array, taken: jax.Array
     ) -> tuple[jax.Array, jax.Array | None]:
-        """The heights after what was taken up near the blade was handed on by one cell, and what was lost."""
+        """The heights after the sand `taken` from the inner part moved one cell on, and what each cell lost over a rim."""
         there, holds = self.part(h), self.part(view.holds)
         taken = taken * at(holds)
         over = self.over(way, view, there)
@@ -228,9 +263,9 @@ class Block:
         return self.put(h, there - taken + kept + got), lost
 
     def contact(self, way: Way, view: View, cover: jax.Array, h: jax.Array) -> jax.Array:
-        """1 while the blade is among the sand, falling to 0 where it covers no cell or hangs a spacing above all it covers.
+        """How much the blade is in contact with sand: 1 in it, falling to 0 a spacing above it or where it covers no cell.
 
-        Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
+        Rates are multiplied by it, so that a tool that touches nothing moves no sand that is still only to a tolerance.
         """
         spacing, bottom = way.spacing / way.quantum, way.bottom / way.quantum
         near = jnp.clip(1 + jnp.maximum(self.part(h) - bottom, -spacing) / spacing, 0, 1) * at(self.part(view.holds))
@@ -238,5 +273,6 @@ class Block:
 
 
 def pose_ahead(frame: Frame, by: jax.Array) -> Pose:
+    """The frame's pose moved ahead by a length (spacings)."""
     pose = frame.pose
     return Pose(pose.x + by * pose.cos, pose.y + by * pose.sin, pose.cos, pose.sin)

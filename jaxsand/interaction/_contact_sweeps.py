@@ -1,44 +1,47 @@
-"""Sweeps around a tool that stands in the sand, and their derivative: what a sub-step of a push keeps and pulls back.
+"""Sweeps around a tool that stands in the sand, and their vjp.
 
-For the surface s of each sweep, D its steps over the links, e the excess of those over repose, g how open a link is and l
-its length, a sweep moves h by G (rate g e / l); see flux_adjoint.py. With y = D lambda, summed over the sweeps,
+Let s be the surface before a sweep, D s its steps over the links, e their excess over repose, g the open share of a link and
+l its length. A sweep adds G (rate g e / l) to the heights; see flux_adjoint.py. With y = D lambda, and sums over all sweeps,
 
-    E = sum of e y        gives  -rate E / l  for g  and  -sum of g E / l  for the rate,
-    M = sum of sigma g y  gives  rate M       for the largest stable step of a straight link.
+    E = sum of e y        gives the cotangents  -rate E / l  of g  and  -sum of g E / l  of the rate, and
+    M = sum of sigma g y  gives the cotangent   rate M       of the largest stable step of a straight link.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.autodiff.while_loop import Plain, repeat, split
+from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Around, flows
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 
+Params: TypeAlias = tuple[Bed, Flow, Around]
+State: TypeAlias = tuple[jax.Array, Lost]
+
 
 @dataclass(frozen=True)
 class Beside:
-    """So many sweeps around a tool as one step of a loop; `params` are the bed, the flow and the tool that stands there."""
+    """A number of sweeps around a tool as one step of a loop; `params` are the bed, the flow and the tool in the sand."""
 
     sweeps: int
     tape: int = 1
 
-    def __call__(self, params: Any, k: jax.Array, state: tuple[jax.Array, Lost]) -> tuple[jax.Array, Lost]:
+    def __call__(self, params: Params, k: jax.Array, state: State) -> State:
         return repeat(_SWEEP, self.sweeps, params, state)
 
-    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+    def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, State]:
         return self(params, k, state), state
 
-    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+    def push(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
         return Plain(self).push(params, k, record, dparams, dstate)
 
-    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+    def pull(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
         bed, flow, around = params
         if not by_hand(bed) or not self.sweeps:
             return Plain(self).pull(params, k, record, cotangent)
@@ -50,14 +53,14 @@ class Beside:
 
 
 def by_hand(bed: Bed) -> bool:
-    """Whether the derivatives here hold: sand flows in pairs and over no rim."""
+    """Whether the derivatives written out here hold: with 4 or 8 neighbours and a closed edge."""
     return bed.neighbours != "isotropic" and bed.rim is None
 
 
 @dataclass(frozen=True)
 class Pulled:
-    """Cotangents of a height [H, W] before some sweeps, of the tool's `open` share, `stretch` and `bottom`, of the sweeps'
-    `rate` and of the bed's `drop`."""
+    """The cotangents of what some sweeps depend on: the height [H, W] before them, the tool's `open` share, `stretch` and
+    `bottom`, the sweeps' `rate`, and the bed's `drop`."""
 
     height: jax.Array
     open: jax.Array
@@ -68,7 +71,7 @@ class Pulled:
 
 
 def surfaces(bed: Bed, flow: Flow, around: Around, sweeps: int, height: jax.Array) -> jax.Array:
-    """The surface before each sweep."""
+    """The surface before each sweep, [sweeps, H, W]."""
 
     def again(i: jax.Array, kept: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         h, tape = kept
@@ -81,7 +84,7 @@ def surfaces(bed: Bed, flow: Flow, around: Around, sweeps: int, height: jax.Arra
 
 
 def _sweep(bed: Bed, flow: Flow, around: Around, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """One sweep of a map [H, W], which needs a halo only of its surface."""
+    """One sweep of a map [H, W]; only its surface needs ghost cells."""
     moved = counted(flow, flows(bed, around.open, halo(around.surface(h))))
     return pass_over(bed, flow, moved, h, lost)
 
@@ -90,7 +93,7 @@ _SWEEP = Plain(lambda params, _, state: _sweep(*params, *state))
 
 
 def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.Array) -> Pulled:
-    """What the cotangent [H, W] of the height after the sweeps tells of everything before them."""
+    """The vjp of the sweeps whose surfaces are on the tape, for a cotangent [H, W] of the height after them."""
     sweeps = tape.shape[0]
     gates = [jnp.minimum(here, there) for here, there in adjoint.pairs(bed, around.open)]
     lengths = [length for _, _, length in links(bed.neighbours)]

@@ -1,9 +1,8 @@
-"""Where sand goes that a tool displaces.
+"""Displacement: where the sand goes that a tool pushes out of cells.
 
-Whenever the share of a cell that the tool covers grows from a to b, the share (b - a) / (1 - a) of its sand above the
-tool's bottom has to leave. It goes to neighbouring cells, to the one or two of the eight that lie in its direction,
-shared as the direction divides the angle between them. Every amount is a whole number of quanta (see ghost_cells.py), so
-that volume is kept as well as floats allow.
+Whenever the share of a cell that the tool covers grows from a to b, the share (b - a) / (1 - a) of its sand above the tool's
+bottom has to leave. It goes to the one or two of the eight neighbouring cells that lie in the direction of displacement,
+divided between them by angle. Every amount is a whole number of quanta (see ghost_cells.py), which conserves volume.
 """
 
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import repeat
 from jaxsand.interaction._contact_sweeps import Beside
@@ -25,18 +25,26 @@ Shares = list[jax.Array]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Job:
-    """What every part of a push needs: the bed, the cell centres (m), the tool, its bottom's height (m), how sand flows."""
+    """What every part of a push needs.
+
+    Attributes:
+        bed: spacing, largest stable steps and rim.
+        x, y: coordinates of the cell centres (m).
+        tool: the blade or wheel.
+        bottom: height of the tool's lowest point (m).
+        flow: rate and quantum of sweeps.
+    """
 
     bed: Bed
-    x: jax.Array  # [1, W]
-    y: jax.Array  # [H, 1]
-    tool: Any  # a Blade or a Wheel
-    bottom: jax.Array  # [], or [H, W] where it is not flat
+    x: Float[Array, "1 W"]
+    y: Float[Array, "H 1"]
+    tool: Any
+    bottom: Float[Array, ""]
     flow: Flow
 
 
 def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Takes up the sand that has to leave as the cover grows: the height left and the height taken."""
+    """The height left and the height taken of each cell, as the footprint grows from `before` to `cover`."""
     grown = cover > before
     share = jnp.where(grown, (cover - before) / jnp.where(grown, 1 - before, 1), 0)
     taken = whole(job, share * jnp.where(h > job.bottom, h - job.bottom, 0))
@@ -44,9 +52,9 @@ def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[j
 
 
 def shares(p: jax.Array, q: jax.Array) -> Shares:
-    """Shares of the eight neighbours for a direction (p along columns, q along rows) of largest component 1 or less.
+    """The shares of the eight neighbours for displacement along (p, q), p along x and q along y, |p| and |q| at most 1.
 
-    Bilinear; the part that would stay in place goes to the four straight neighbours alike.
+    They are bilinear weights; the part that would stay in place goes to the four straight neighbours in equal shares.
     """
     columns = {-1: jnp.maximum(-p, 0), 0: 1 - jnp.abs(p), 1: jnp.maximum(p, 0)}
     rows = {-1: jnp.maximum(-q, 0), 0: 1 - jnp.abs(q), 1: jnp.maximum(q, 0)}
@@ -55,9 +63,9 @@ def shares(p: jax.Array, q: jax.Array) -> Shares:
 
 
 def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
-    """1 while the blade is among the sand, falling to 0 where it covers no cell or hangs a spacing above all it covers.
+    """How much the blade is in contact with sand: 1 in the sand, falling to 0 a spacing above it or where it covers no cell.
 
-    Keeps a tool that touches nothing from moving sand that is still only to a tolerance.
+    Rates are multiplied by it, so that a tool that touches nothing moves no sand that is still only to a tolerance.
     """
     above = jnp.where(jnp.isnan(h), -jnp.inf, h) - job.bottom
     near = jnp.clip(1 + jnp.maximum(above, -job.bed.spacing) / job.bed.spacing, 0, 1)
@@ -65,10 +73,10 @@ def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
 
 
 def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """Sweeps the sand around a blade that covers the share `cover` of each cell."""
+    """The height and the losses after some sweeps of the sand around a blade whose footprint is `cover`."""
     return repeat(Beside(sweeps), 1, (job.bed, flow, stand(cover, job.bottom)), (h, lost))
 
 
 def whole(job: Job, amount: jax.Array) -> jax.Array:
-    """Cut to whole quanta."""
+    """The amount (m) cut to whole quanta."""
     return truncate(amount / job.flow.quantum) * job.flow.quantum

@@ -1,38 +1,36 @@
-"""The part of a map around a tool, seen so that the tool heads between +x and the diagonal.
+"""The frame of a tool: a block of the map, mirrored so that the tool heads between +x and the diagonal.
 
-Mirrors and a swap of the axes take any heading into the first octant, where a step ahead leads to one of two neighbours. A
-block is fetched from the map in that frame, cell by cell, and set back the same way; what of it lies off the map is void.
+Mirrors and a swap of the axes turn any heading into the first octant, where a step ahead leads to one of two neighbours. A
+block is read from the map in that frame, cell by cell, and written back the same way. Its cells off the map hold no sand.
 
-Maps here are [H, W] or, for a batch, [H, W, B], and what belongs to one map is a number or [B]: arithmetic broadcasts from
-the right, and a batch is computed with its maps in the lanes of the vector unit. In flat maps the cells are one axis, by
-rows.
+Maps are [H, W] or, for a batch, [H, W, B], and a value for each map is a scalar or [B]: arithmetic broadcasts from the
+right, and the maps of a batch lie in the lanes of the vector unit. Flat maps [cells] hold the cells row by row.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxsand.scene.tools import Pose
 
-Block = Any
-
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Frame:
-    """A tool's view of a map of `shape` cells: mirrored along x, along y, and with x and y swapped, each or not; lengths
-    are in spacings."""
+    """A tool's view of a map of `shape` cells: mirrored along x or y, then with x and y swapped, each or not.
 
-    pose: Pose  # in this frame
+    `pose` is the tool's pose in this frame, in spacings.
+    """
+
+    pose: Pose
     flip_x: jax.Array
     flip_y: jax.Array
     swap: jax.Array
     shape: tuple[int, int] = field(metadata={"static": True})
 
     def extent(self) -> tuple[jax.Array, jax.Array]:
-        """How many cells the map has across and up, seen from here."""
+        """The numbers of columns and rows of the map in this frame."""
         rows, columns = self.shape
         return jnp.where(self.swap, rows, columns), jnp.where(self.swap, columns, rows)
 
@@ -49,7 +47,7 @@ def frame_of(shape: tuple[int, int], pose: Pose) -> Frame:
 
 
 def numbers(count: int, axis: int, like: jax.Array) -> jax.Array:
-    """0, 1, ... along an axis of a map, to be broadcast against what belongs to one map."""
+    """0, 1, ... along an axis of a map, shaped to broadcast against `like`, a value for each map."""
     shape = (1, count) if axis else (count, 1)
     return jnp.arange(count, dtype=like.dtype).reshape(*shape, *(1,) * like.ndim)
 
@@ -57,16 +55,22 @@ def numbers(count: int, axis: int, like: jax.Array) -> jax.Array:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Places:
-    """Where the cells of a block lie: their place in a flat map, and whether they lie on the map at all."""
+    """Where the cells of a block lie on the map, [m, m] or [m, m, B] each.
 
-    index: jax.Array  # [m, m]
-    inside: jax.Array  # [m, m]
+    Attributes:
+        index: place in the flat map; beyond its end for cells off the map.
+        inside: whether the cell lies on the map.
+        row, column: row and column on the map.
+    """
+
+    index: jax.Array
+    inside: jax.Array
     row: jax.Array
     column: jax.Array
 
 
 def places(frame: Frame, size: int, first: tuple[jax.Array, jax.Array]) -> Places:
-    """The places of the block of `size` squared that begins at `first`; those off the map lie beyond its last cell."""
+    """The places of the block of `size` x `size` cells whose first cell (column, row) in the frame is `first`."""
     rows, columns = frame.shape
     a = first[0] + numbers(size, 1, first[0])
     b = first[1] + numbers(size, 0, first[1])
@@ -78,7 +82,7 @@ def places(frame: Frame, size: int, first: tuple[jax.Array, jax.Array]) -> Place
 
 
 def cut(where: Places, flat: jax.Array, void: float = jnp.nan) -> jax.Array:
-    """The block of a flat map [cells], with `void` off the map."""
+    """The block of a flat map [cells], with the value `void` off the map."""
     index = where.index.reshape(-1, *where.index.shape[2:])
     block = jnp.take_along_axis(flat, index, axis=0, mode="fill", fill_value=void)
     return block.reshape(where.index.shape)
@@ -95,7 +99,7 @@ def paste(where: Places, flat: jax.Array, block: jax.Array) -> jax.Array:
 
 
 def shifted(maps: tuple[jax.Array, ...], by: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
-    """What maps of links hold after their block has moved on by 0 or 1 cells across and up; 0 where nothing was known."""
+    """Maps of fluxes after their block has moved by 0 or 1 cells across and up; 0 over links that are new in the block."""
 
     def one(x: jax.Array) -> jax.Array:
         x = jnp.where(by[0] > 0, jnp.concatenate([x[:, 1:], jnp.zeros_like(x[:, :1])], 1), x)

@@ -1,7 +1,7 @@
-"""A blade is lowered: what it covers leaves radially."""
+"""Lowers a blade: the sand that it covers is displaced radially."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +14,13 @@ from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at, truncate
 
+Params: TypeAlias = tuple[blade.Shares, jax.Array, jax.Array, tuple[jax.Array, jax.Array] | None]
+Carried: TypeAlias = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was lost, and what is carried (quanta)
+
 
 @dataclass(frozen=True)
 class Lower(Step):
-    """The blade comes down: what it covers leaves radially, until all of it rests."""
+    """The step in which the blade comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1
 
@@ -49,15 +52,16 @@ class Lower(Step):
         return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge)
 
 
-def _spread(params: Any, k: jax.Array, state: Any) -> Any:
-    """Sand handed on by one cell: it comes to rest in the open share of cells, and moves on in the rest."""
+def _spread(params: Params, k: jax.Array, state: Carried) -> Carried:
+    """Moves the carried sand by one cell: it stays in the open share of cells, and is carried on in the covered share."""
     shares, holds, cover, over = params
     h, gone, carried = state
     free = None if over is None else (over[0], over[1] * carried)
     kept, got, lost = blade.handed_on(shares, holds, carried, free)
     rest = truncate((1 - cover) * got)
-    return h + rest + kept, None if gone is None else gone + lost, got - rest
+    return h + rest + kept, None if gone is None or lost is None else gone + lost, got - rest
 
 
-def _at_rest(params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _at_rest(params: Params, k: jax.Array, state: Carried) -> jax.Array:
+    """Whether no sand is being carried any more."""
     return ~jnp.any(state[2] > 0)

@@ -1,8 +1,8 @@
-"""What of a blade's berms and heap runs off over a draining edge.
+"""The part of a blade's berms and heap that runs off over a draining edge.
 
-Sand can stand as high as the rim, and mu higher with the distance from it, mu = tan(angle of repose). What a blade would
-set down above that, or beyond the edge, runs off. In front of a rim above the sand it piles up as before a wall, until it
-is as high.
+At the distance r from the rim, sand can stand mu r higher than the rim, mu = tan(angle of repose). Sand that a blade would
+set down above that, or beyond the edge, runs off. In front of a rim that is higher than the sand, sand piles up as before a
+wall until it is as high as the rim.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,16 @@ from jaxsand.scene.tools import Pose
 
 @dataclass(frozen=True)
 class Rim:
-    """A draining edge: the map's lengths along x and y (m), its rim's `level` over the sand's, and how open the blade's
-    flanks are [2] in the end, where a heap may reach over it."""
+    """A draining edge, as a blade's leg meets it.
+
+    Attributes:
+        size: the map's lengths along x and y (m).
+        level: height of the rim (m).
+        ground: mean height of the sand in the blade's way (m).
+        flanks: how open the blade's two flanks are at the end of the leg, 0 to 1.
+        away: number of cells from each cell to the edge, along rows or columns without walls.
+        seen: cells to which sand can come from the blade; see `within_reach`.
+    """
 
     size: tuple[jax.Array, jax.Array]
     level: jax.Array
@@ -36,7 +44,10 @@ class Rim:
         return cls((columns * dx, rows * dx), job.bed.rim.level, ground, jnp.ones(2, sand.dtype), _from_edge(sand), seen)
 
     def outside(self, pose: Pose, s: jax.Array, n: jax.Array, seen: jax.Array, dx: jax.Array) -> jax.Array:
-        """1 beyond the edge, smoothed over a spacing, where cells on this side are `seen`; s along and n across."""
+        """1 at points beyond the edge, smoothed over a spacing, if the cells on this side are `seen`.
+
+        The points lie s ahead of the pose and n to its left (m).
+        """
         x, y = spot(pose, s, n)
         free = between(seen, x / dx - 0.5, y / dx - 0.5)
         return jnp.clip(0.5 - inside(self.size, x, y) / dx, 0, 1) * jnp.clip(2 * free - 1, 0, 1)
@@ -44,8 +55,10 @@ class Rim:
     def berms(
         self, pose: Pose, place: jax.Array, side: jax.Array, reach: jax.Array, peak: jax.Array, dx: jax.Array
     ) -> jax.Array:
-        """The share of the berms to the left and right [2, n] at `place` that runs off; of sand `peak` high what is higher
-        than the rim."""
+        """The share of the left and the right berm, [2, n], that runs off at each `place` along the leg.
+
+        Of a berm that is `peak` high, the part above the rim runs off.
+        """
         off = side + reach / 3
         out = jnp.stack([self.outside(pose, place, n, self.seen, dx) for n in (off, -off)])
         under = jnp.stack([self.outside(pose, place, n, self.seen, dx) for n in (-side, 0 * side, side)])
@@ -54,7 +67,10 @@ class Rim:
     def beyond(
         self, pose: Pose, end: jax.Array, side: jax.Array, farthest: jax.Array, mu: jax.Array, dx: jax.Array
     ) -> Holds:
-        """What of a mound of a given reach would lie beyond the edge and above its rim (cells, over mu)."""
+        """A function from a mound's reach to the volume that would lie beyond the edge and above the rim, and its slope.
+
+        Volumes are sums of heights over cells, divided by mu.
+        """
         ahead, across = (jnp.arange(8, dtype=end.dtype) + 0.5) / 8, (jnp.arange(16, dtype=end.dtype) - 7.5) / 8
         u, n = (farthest * ahead)[:, None], ((side + farthest) * across)[None, :]
         away = distance(u, jnp.maximum(jnp.abs(n) - side, 0))
@@ -69,12 +85,12 @@ class Rim:
         return holds
 
     def room(self, job: Job, h: jax.Array, mu: jax.Array) -> jax.Array:
-        """How much higher sand can stand: up to the rim, and mu higher with the distance from it."""
+        """How much higher than h sand can stand (m): at the distance r from the rim, up to mu r above the rim."""
         return jnp.maximum(self.level + mu * self.away * job.bed.spacing - jnp.where(jnp.isnan(h), 0, h), 0)
 
 
 def _from_edge(sand: jax.Array) -> jax.Array:
-    """How many cells away the edge is, along rows or columns that hold sand all the way."""
+    """The distance of each cell to the edge in cells, along rows or columns that hold sand all the way."""
     away = jnp.full_like(sand, sum(sand.shape))
     for axis in (0, 1):
         for way in (sand, jnp.flip(sand, axis)):
@@ -84,5 +100,5 @@ def _from_edge(sand: jax.Array) -> jax.Array:
 
 
 def nothing_beyond(reach: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Of a closed edge: nothing runs off."""
+    """The `Holds` of a closed edge: nothing runs off."""
     return jnp.zeros_like(reach), jnp.zeros_like(reach)

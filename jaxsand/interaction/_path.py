@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._displacement import Job
 from jaxsand.relaxation.flux import worst_excess
 from jaxsand.relaxation.ghost_cells import (
@@ -60,8 +60,8 @@ class Pushed:
 
 
 State = tuple[jax.Array, Lost, jax.Array]  # height, height lost over the rim, movement at the window's edge
-Record = Callable[[jax.Array], Any]  # what to keep of a map after each leg
 Leg = Callable[[Job, Pose, jax.Array, Pose | None, State], State]
+Record = Callable[[jax.Array], Tree]  # what to note of the height [H, W] (m) after each leg
 
 
 def along_legs(
@@ -71,7 +71,7 @@ def along_legs(
     rate: jax.Array | float,
     leg: Leg,
     record: Record | None = None,
-) -> tuple[Pushed, Any]:
+) -> tuple[Pushed, Tree]:
     """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it.
 
     `leg(job, pose, length, before, state)` moves the tool from `pose` by `length` (m). `before` is the tool's pose at the
@@ -108,7 +108,7 @@ def along_legs(
     state = leg(job, pose, length, None, state)
     frames = [record(unmark(state[0], height))] if record else []
 
-    def later_leg(carry: Any, ends: Any) -> tuple[Any, Any]:
+    def later_leg(carry: tuple[Pose, State], ends: tuple[jax.Array, jax.Array]) -> tuple[tuple[Pose, State], Tree]:
         before, state = carry
         pose, length = _heading(ends[0], ends[1], before)
         state = leg(job, pose, length, Pose(pose.x, pose.y, before.cos, before.sin), state)

@@ -1,5 +1,4 @@
-"""The steps of a wheel's leg: it is lowered, it turns in place, and it moves ahead. Each is a step of a loop
-(while_loop.py)."""
+"""The steps of a wheel's leg: it is lowered, turns in place, and moves ahead. Each is a step of a loop of while_loop.py."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.autodiff.while_loop import Plain, repeat_until
+from jaxsand.autodiff.while_loop import Plain, Tree, repeat_until
 from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import Step
-from jaxsand.interaction._block import Moving, View, pose_ahead
+from jaxsand.interaction._block import Block, Moving, View, pose_ahead
 from jaxsand.interaction._frame import Frame, frame_of, shifted
 from jaxsand.interaction._turning import rotated
 from jaxsand.interaction._wheel import Stand, Track
@@ -22,11 +21,12 @@ from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.tools import Pose
 
 Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)
+Carried = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was lost, and what is carried (quanta)
 
 
 @dataclass(frozen=True)
 class Touchdown(Step):
-    """The wheel comes down: what it covers leaves radially, until all of it rests."""
+    """The step in which the wheel comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1
 
@@ -48,22 +48,23 @@ class Touchdown(Step):
 
 @dataclass(frozen=True)
 class _Onward:
-    """Sand that is on its way under the wheel is handed on by one cell."""
+    """The step in which sand under the wheel moves on by one cell."""
 
-    block: Any
+    block: Block
 
-    def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
+    def __call__(self, params: tuple[Track, View, wheel.Shares, Stand], k: jax.Array, state: Carried) -> Carried:
         track, view, shares, here = params
         return wheel.handed_on(self.block, track, view, shares, here, state)
 
 
-def _at_rest(params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _at_rest(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
+    """Whether no sand is being carried any more."""
     return ~jnp.any(state[2] > 0)
 
 
 @dataclass(frozen=True)
 class _Moved(Step):
-    """A step in which the wheel moves and the sand is brought to rest around it, `sweeps` proximal steps at a time."""
+    """A step in which the wheel moves, and `sweeps` proximal steps after each sub-step bring the sand to rest around it."""
 
     substep: float = 0.125
     sweeps: int = 4
@@ -77,9 +78,9 @@ class _Moved(Step):
         part: jax.Array,
         h: jax.Array,
         flux: Fluxes,
-        taken: Any,
+        taken: jax.Array,
     ) -> Sanded:
-        """The sand once what was taken up has left the wheel, which then stands there, and all was brought to rest."""
+        """The sand after what was taken up has left the wheel's new place `now`, and was brought to rest around it."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
         around, among = wheel.around(self.block, track, view, now, h)
         guess = self.block.guess(around.gates, among * part, flux)
@@ -89,12 +90,14 @@ class _Moved(Step):
 
 @dataclass(frozen=True)
 class Turn(_Moved):
-    """A part of a turn in place: the wheel turns by as much as moves its corners by `substep` spacings."""
+    """A sub-step of a turn in place, which moves the wheel's corners by `substep` spacings."""
 
-    def turned(self, track: Track, k: jax.Array, _: Any) -> jax.Array:
+    def turned(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
+        """Whether the turn is complete before step k."""
         return jnp.all(k.astype(track.way.angle.dtype) * self._part(track) >= jnp.abs(track.way.angle))
 
     def _part(self, track: Track) -> jax.Array:
+        """The angle of a sub-step (rad)."""
         far = jnp.minimum(jnp.hypot(track.radius, track.way.side), math.hypot(*self.block.shape))
         return self.substep / far
 
@@ -119,15 +122,16 @@ class Turn(_Moved):
 
 @dataclass(frozen=True)
 class Roll(_Moved):
-    """So many sub-steps ahead, `chunk` of them within a spacing, in a block around where they lead.
+    """`chunk` sub-steps ahead, over a spacing at most, in one block.
 
-    If the wheel has just come down, the first step lets the sand come to rest around it.
+    If the wheel has just been lowered, the first step only brings the sand to rest around it.
     """
 
     chunk: int = 8
     lowered: bool = False
 
-    def arrived(self, track: Track, k: jax.Array, _: Any) -> jax.Array:
+    def arrived(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
+        """Whether the leg is complete before step k."""
         steps = (k - int(self.lowered)).astype(track.way.length.dtype)
         return (k >= int(self.lowered)) & jnp.all(steps * (self.chunk * self.substep) >= track.way.length)
 
@@ -163,7 +167,7 @@ class Roll(_Moved):
         return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
 
     def _poses(self, track: Track, frame: Frame, k: jax.Array, i: jax.Array) -> tuple[tuple[Frame, Frame], jax.Array]:
-        """The wheel before and after sub-step i of step k, and the way between (spacings)."""
+        """The frames of the wheel before and after sub-step i of step k, and the distance between them (spacings)."""
         length, moving = track.way.length, k >= int(self.lowered)
         steps = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(length.dtype)
         begin = jnp.minimum(steps * self.substep, length)
@@ -172,5 +176,6 @@ class Roll(_Moved):
 
 
 def _at(frame: Frame, by: jax.Array) -> Frame:
+    """The frame with its pose moved ahead by a length (spacings)."""
     pose: Pose = pose_ahead(frame, by)
     return replace(frame, pose=pose)

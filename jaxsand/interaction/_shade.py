@@ -1,4 +1,4 @@
-"""What walls keep a blade's sand from."""
+"""Which cells walls shade from a blade's sand."""
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,10 @@ _BENDS = 2
 
 
 def within_reach(scene: Scene, cover: jax.Array, sand: jax.Array) -> jax.Array:
-    """The cells that hold `sand` [H, W] and to which some can come from what a blade covers (`cover`): along
-    rows and columns, round a few bends, past no solid cell. 0 to 1, continuous in `cover`."""
+    """The cells with `sand` that sand can reach from a blade's footprint `cover`, 0 to 1, continuous in `cover`.
+
+    Sand moves along rows and columns, around a few bends, and past no solid cell.
+    """
     if not isinstance(scene.walls, Walls):
         return sand
     seen = lax.stop_gradient(jnp.minimum(2 * cover, 1) * sand)
@@ -25,7 +27,7 @@ def within_reach(scene: Scene, cover: jax.Array, sand: jax.Array) -> jax.Array:
 
 
 def _along(seen: jax.Array, sand: jax.Array, axis: int) -> jax.Array:
-    """The largest value along a row or column, up to the next cell without sand."""
+    """The largest value along each row or column, between the nearest cells without sand."""
 
     def join(a: tuple[jax.Array, jax.Array], b: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         return jnp.maximum(b[0], b[1] * a[0]), a[1] * b[1]
@@ -36,19 +38,22 @@ def _along(seen: jax.Array, sand: jax.Array, axis: int) -> jax.Array:
 
 
 def spot(pose: Pose, s: jax.Array, n: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where on the map places lie that are s along a heading and n across it (m)."""
+    """The map coordinates x and y of points that lie s ahead of a pose and n to its left (m)."""
     return pose.x + s * pose.cos - n * pose.sin, pose.y + s * pose.sin + n * pose.cos
 
 
 def inside(size: tuple[jax.Array, jax.Array], x: jax.Array, y: jax.Array) -> jax.Array:
-    """How far places lie from the nearest edge of a map of a `size` (m), below 0 outside of it."""
+    """The distance (m) of points from the nearest edge of a map of lengths `size`; negative outside."""
     return jnp.minimum(jnp.minimum(x, size[0] - x), jnp.minimum(y, size[1] - y))
 
 
 def on_line(
     scene: Scene, pose: Pose, place: jax.Array, across: jax.Array, dx: jax.Array, weights: np.ndarray | None = None
 ) -> jax.Array:
-    """How much of lines across a heading, at `place` [n] along it, is on the map: a mean over the places `across` [m]."""
+    """The part of lines across a heading that lies on the map, one line at each `place` [n] along it.
+
+    It is the mean, or the weighted sum, over the points `across` [m] of each line.
+    """
     rows, columns = scene.grid.shape
     x, y = spot(pose, place[:, None], jnp.asarray(across, place.dtype)[None])
     away = inside((columns * dx, rows * dx), x, y)
@@ -57,7 +62,7 @@ def on_line(
 
 
 def between(field: jax.Array, column: jax.Array, row: jax.Array) -> jax.Array:
-    """The field between the cell centres, bilinear; beyond the map that of its outer cells."""
+    """A field interpolated bilinearly between cell centres; beyond the map it has the value of the nearest cell."""
     rows, columns = field.shape
     row, column = jnp.clip(row, 0, rows - 1), jnp.clip(column, 0, columns - 1)
     i, j = jnp.floor(row).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)

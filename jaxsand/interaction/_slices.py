@@ -1,7 +1,7 @@
-"""Slices across a stroke: what of a map belongs to each, and what of each to a cell.
+"""Slices across a stroke: sums of a map over each slice, and values of slices at each cell.
 
-A cell belongs to the two slices next to it, each with its hat: 1 in the slice's middle and 0 from the next one's on. No map
-of shares is stored.
+A slice weighs cells by a hat function, 1 in its middle and 0 from the middle of the next slice on, so that a cell belongs to
+the two slices next to it. Positions `at` along the stroke are counted in slices.
 """
 
 import jax
@@ -14,13 +14,13 @@ POINTS, WEIGHTS = np.array([0.155051, 0.644949]), np.array([0.636083, 0.363917])
 
 
 def in_slices(at: jax.Array, count: int, amount: jax.Array) -> jax.Array:
-    """How much of an amount [H, W] belongs to each slice; rows first: XLA vectorises that, and stores no shares."""
+    """The part of an amount [H, W] that belongs to each slice, [count]; XLA vectorises it and stores no weights."""
     slices = jnp.arange(count, dtype=at.dtype)[:, None, None]
     return jnp.sum(jnp.sum(jnp.maximum(1 - jnp.abs(at[None] - slices), 0) * amount[None], axis=1), axis=1)
 
 
 def of_slices(at: jax.Array, left: jax.Array, values: jax.Array) -> jax.Array:
-    """Values [2, n] of the slices' left and right sides at each cell, by how much of it lies to the left."""
+    """The values [2, n] of the slices' left and right sides at each cell, mixed by the share of the cell on the left."""
     many = -(-values.shape[1] // _CHUNK)
     values = jnp.concatenate([values, jnp.zeros((2, many * _CHUNK - values.shape[1]), values.dtype)], axis=1)
 
@@ -36,18 +36,18 @@ def of_slices(at: jax.Array, left: jax.Array, values: jax.Array) -> jax.Array:
 
 
 def hat(at: jax.Array, slices: jax.Array) -> jax.Array:
-    """How much of a place belongs to each slice [k, ...]."""
+    """The weights of places in each slice, [k, ...]."""
     return jnp.maximum(1 - jnp.abs(at - slices[:, None]), 0)
 
 
 def to_slice(x: jax.Array) -> jax.Array:
-    """The integral of a slice's hat up to x."""
+    """The integral of the hat function from -1 to x."""
     x = jnp.clip(x, -1, 1)
     return 0.5 + x - x * jnp.abs(x) / 2
 
 
 def wedge(u: jax.Array, reach: jax.Array, dx: jax.Array) -> jax.Array:
-    """The mean over a spacing around u of a wedge on [0, reach] that falls to 0; they add up to 1."""
+    """The integral over a spacing around u of a wedge on [0, reach] that falls to 0 and has the area 1."""
 
     def area(u: jax.Array) -> jax.Array:
         part = jnp.clip(u / reach, 0, 1)

@@ -1,8 +1,7 @@
-"""A blade turns in place, by sub-steps of an angle: what it sweeps leaves along its faces."""
+"""Turns a blade in place, by sub-steps of an angle: the sand that it sweeps is displaced along its faces' normals."""
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +18,18 @@ from jaxsand.scene.tools import Pose
 
 @dataclass(frozen=True)
 class Turn(Step):
-    """A part of a turn in place: the blade turns by as much as moves its corners by `substep` spacings."""
+    """A sub-step of a turn in place, which moves the blade's corners by `substep` spacings."""
 
     substep: float = 0.125
     sweeps: int = 4
     rest: Rest = bring_to_rest
 
-    def turned(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
+    def turned(self, way: Way, k: jax.Array, _: Moving) -> jax.Array:
+        """Whether the turn is complete before step k."""
         return jnp.all(k.astype(way.angle.dtype) * self._part(way) >= jnp.abs(way.angle))
 
     def _part(self, way: Way) -> jax.Array:
+        """The angle of a sub-step (rad)."""
         far = jnp.minimum(jnp.hypot(way.half, way.side), math.hypot(*self.block.shape))
         return self.substep / far
 
@@ -59,5 +60,6 @@ class Turn(Step):
 
 
 def rotated(pose: Pose, angle: jax.Array) -> Pose:
+    """The pose turned in place by an angle (rad), counter-clockwise."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     return Pose(pose.x, pose.y, pose.cos * cos - pose.sin * sin, pose.sin * cos + pose.cos * sin)

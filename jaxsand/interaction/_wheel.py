@@ -1,14 +1,14 @@
-"""What a wheel does to the sand in a block around it: it clears what it newly covers, and parts what it stands between.
+"""A wheel in a block of sand: displacement from the cells that it newly covers, and links that it closes.
 
-A wheel is a rim over each cell, at a height b of its own (tools.py), with room below where it hangs above the sand. Where it
-covers the share a of a cell, the cell's sand above b lies in the open share 1 - a. What comes to lie above the rim as the
-wheel moves leaves it along the normal of the face that displaces it, the rim or the flank that leads; off the rim also
-towards the nearer flank. Sand under the wheel is handed on, cell by cell, until there is room beside it or below the rim.
-Grousers take some of what is displaced to behind the wheel.
+Over each cell the wheel's rim stands at a height b of its own (tools.py); sand can lie below it. Where the wheel covers the
+share a of a cell, the cell's sand above b lies in the open share 1 - a. Sand that comes to lie above the rim as the wheel
+moves is displaced along the normal of the face that moves it, the rim or the leading flank; sand off the rim also moves
+towards the nearer flank. Sand under the wheel moves on, cell by cell, until there is room beside the wheel or below the rim.
+Grousers carry some of it to behind the wheel.
 
-The wheel is a wall as far as sand touches it. Sand that lies lower than the rim is as free as if there were no wheel; within
-a quarter of a spacing below it the wheel begins to be felt. The planes through the axle and across it, as wide as the wheel,
-cut every link whose ends lie on their two sides, as far as both ends touch: where one does not, sand passes under the rim.
+The wheel also closes links where sand touches it. It has no effect on sand more than a quarter of a spacing below the rim.
+Two planes, along and across the axle, as wide as the wheel, cut every link whose ends lie on their two sides, as far as sand
+touches the wheel at both ends. Where it does not, sand passes under the rim.
 """
 
 from dataclasses import dataclass, replace
@@ -26,10 +26,10 @@ from jaxsand.relaxation.flux import NARROW, Fluxes
 from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.grid import Neighbours
 
-_TOUCH = 0.25  # of a spacing below the rim, sand does not feel it
-_PASSES = 4  # how many cells sand under the wheel moves on in a sub-step
-_SLIVER = 0.002  # in an open share below this sand stands no higher than it would in this one
-_ASIDE = 0.5  # how far to its side sand leaves the rim at its edges, to a unit ahead
+_TOUCH = 0.25  # spacings below the rim at which the wheel begins to touch sand
+_PASSES = 4  # cells by which sand under the wheel moves on in a sub-step
+_SLIVER = 0.002  # the smallest open share that is divided by: in a narrower one sand stands as high as in this
+_ASIDE = 0.5  # sideways part of the displacement at the rim's two edges, over the part ahead
 _LEAST = 1e-4
 _FOUR = ((0, 1), (0, -1), (1, 0), (-1, 0))
 Shares = tuple[jax.Array, ...]  # of the four straight neighbours, in a halo
@@ -38,9 +38,14 @@ Shares = tuple[jax.Array, ...]  # of the four straight neighbours, in a halo
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Track:
-    """A leg of a wheel: the way of its lowest point, as that of a blade as thick as the wheel's chord at level sand; its
-    radius (spacings); its slip angle; and what its grousers carry to a spacing of the way (m, as the height of a cell), None
-    for a smooth rim."""
+    """A leg of a wheel.
+
+    Attributes:
+        way: the leg of a blade as thick as the wheel's chord at level sand, with its bottom at the wheel's lowest point.
+        radius: the wheel's radius (spacings).
+        slip: the wheel's slip angle (rad).
+        carried: what grousers carry for each spacing of the leg (m, as the height of one cell), or None without grousers.
+    """
 
     way: Way
     radius: jax.Array
@@ -48,15 +53,20 @@ class Track:
     carried: jax.Array | None
 
     def seen(self, frame: Frame) -> jax.Array:
-        """The slip angle in a frame, which may mirror the map."""
+        """The slip angle in a frame, where a mirror changes its sign."""
         return jnp.where(frame.flip_x ^ frame.flip_y ^ frame.swap, -self.slip, self.slip)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Stand:
-    """A wheel in a block, [m, m]: how far along its plane and along its axle cells lie (spacings), the share of each that it
-    covers along either, and the rim's height (quanta)."""
+    """A wheel in a block, maps [m, m].
+
+    Attributes:
+        along, aside: distance of each cell from the wheel's centre along its plane and along its axle (spacings).
+        lengthwise, crosswise: share of each cell that the wheel covers in these two directions.
+        rim: height of the rim (quanta).
+    """
 
     along: jax.Array
     aside: jax.Array
@@ -66,12 +76,16 @@ class Stand:
 
     @property
     def cover(self) -> jax.Array:
+        """The footprint: the share of each cell that the wheel covers."""
         return self.lengthwise * self.crosswise
 
 
 def stand(block: Block, track: Track, frame: Frame, first: First) -> Stand:
-    """The wheel at the frame's pose: its rim stands r - sqrt(r^2 - a^2) above its lowest point at the distance a from the
-    axle; coverage as for a blade."""
+    """The wheel at the frame's pose.
+
+    At the distance a from the axle its rim stands r - sqrt(r^2 - a^2) above its lowest point. The footprint is smoothed like
+    a blade's.
+    """
     s, n = (inner(x) for x in block.coordinates(frame, first))
     way, slip = track.way, spread(track.seen(frame), s)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
@@ -83,10 +97,10 @@ def stand(block: Block, track: Track, frame: Frame, first: First) -> Stand:
 
 
 def cleared(track: Track, old: Stand, new: Stand, h: jax.Array) -> jax.Array:
-    """The sand that has to leave the cells of a block as the wheel moves, in whole quanta.
+    """The sand that has to leave the cells of a block as the wheel moves from `old` to `new`, in whole quanta.
 
-    Sand above the rim stood beside the wheel, in the open share of its cell, of which the wheel now sweeps a part. What is
-    still inside of the wheel leaves as well, in cells that it all but fills and which nothing flows into.
+    Sand above the rim stood in the open share of its cell, a part of which the wheel now sweeps. Sand that is still inside
+    the wheel leaves as well, from cells that the wheel almost fills.
     """
     r, side = spread(track.radius, h), spread(track.way.side, h)
     swept = _swept(old.along, new.along, r) * _swept(old.aside, new.aside, side)
@@ -104,10 +118,11 @@ def _swept(old: jax.Array, new: jax.Array, half: jax.Array) -> jax.Array:
 
 
 def leaving(track: Track, frame: Frame, wheel: Stand) -> Shares:
-    """The shares for the directions in which sand leaves the rim and, within two spacings of it, the leading flank.
+    """The shares of the four neighbours for displacement by a wheel that moves ahead.
 
-    In the wheel's plane and along its axle, u from -1 at one flank to 1 at the other, beta the slip angle: off the rim
-    (1, u / 2), off the flank (0, 1); where a face hardly leads, below 30 degrees of the wheel's way, turned to that.
+    As components (along the wheel's plane, along its axle), with u from -1 at one flank to 1 at the other, sand leaves the
+    rim along (1, u / 2), and within two spacings of the leading flank along (0, 1). Where a face is within 30 degrees of
+    the direction of travel, sand is turned towards that direction.
     """
     slip = track.seen(frame)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
@@ -120,15 +135,17 @@ def leaving(track: Track, frame: Frame, wheel: Stand) -> Shares:
 
 
 def turning(track: Track, frame: Frame, wheel: Stand, way: jax.Array) -> Shares:
-    """The shares for a turn in place, counter-clockwise where `way` is 1: along the axle, to where the wheel moves."""
+    """The shares of the four neighbours for a turn in place, counter-clockwise where `way` is 1: along the axle."""
     forward = jnp.clip(wheel.along, -1, 1) * way
     p, q = _on_the_map(track, frame, jnp.zeros_like(forward), forward)
     return _shares(p, q, jnp.abs(forward))
 
 
 def radial(track: Track, frame: Frame, wheel: Stand) -> Shares:
-    """The shares for directions away from the wheel's centre, in the proportions of its chord and width; shorter within a
-    cell of that."""
+    """The shares of the four neighbours for displacement away from the wheel's centre, as the wheel is lowered.
+
+    The direction is the gradient of (along / chord)^2 + (aside / width)^2; within a cell of the centre it has less weight.
+    """
     along, across = wheel.along / track.way.half**2, wheel.aside / track.way.side**2
     p, q = _on_the_map(track, frame, along, across)
     far = jnp.maximum(jnp.abs(wheel.along), jnp.abs(wheel.aside))
@@ -136,7 +153,10 @@ def radial(track: Track, frame: Frame, wheel: Stand) -> Shares:
 
 
 def _shares(p: jax.Array, q: jax.Array, size: jax.Array) -> Shares:
-    """The shares for directions across and up the frame, as |p| to |q|; of a `size` below 1 the rest goes all ways alike."""
+    """The shares of the four neighbours for a direction (p, q) along the frame's x and y, in the proportion |p| : |q|.
+
+    Where `size` is below 1, the rest is divided equally.
+    """
     length = jnp.abs(p) + jnp.abs(q)
     scale = size / jnp.where(length > 0, length, 1)
     p, q = p * scale, q * scale
@@ -146,7 +166,7 @@ def _shares(p: jax.Array, q: jax.Array, size: jax.Array) -> Shares:
 
 
 def _on_the_map(track: Track, frame: Frame, a: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A direction in the wheel's plane and along its axle, as one across and up the frame."""
+    """A direction (along the wheel's plane, along its axle) as components along the frame's x and y."""
     slip = track.seen(frame)
     s, n = a * jnp.cos(slip) + c * jnp.sin(slip), c * jnp.cos(slip) - a * jnp.sin(slip)
     return s * frame.pose.cos - n * frame.pose.sin, s * frame.pose.sin + n * frame.pose.cos
@@ -160,8 +180,11 @@ def handed_on(
     wheel: Stand,
     state: tuple[jax.Array, jax.Array | None, jax.Array],
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
-    """Heights, what was lost, and what is carried (quanta), handed on by one cell: it comes to rest in the open share of
-    cells and where there is room below the rim."""
+    """Moves the carried sand by one cell, where it stays in the open share of cells and as far as there is room below the
+    rim.
+
+    The state holds heights, what was lost over a draining edge, and what is carried (quanta).
+    """
     h, gone, carried = state
     over = block.over(_under(track.way, wheel), view, h + carried)
     kept, got, around = carried, jnp.zeros_like(h), outer(carried)
@@ -181,8 +204,10 @@ def handed_on(
 def displaced(
     block: Block, track: Track, view: View, shares: Shares, wheel: Stand, h: jax.Array, taken: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """The heights (quanta) once what was taken up was handed on by some cells, and what was lost; what is still on its way
-    waits where it is."""
+    """The heights after the sand `taken` moved on by up to `_PASSES` cells, and what each cell lost over a rim (quanta).
+
+    Sand that has found no room by then stays where it is.
+    """
     gone = None if view.beyond is None else jnp.zeros_like(h)
 
     def once(
@@ -195,7 +220,7 @@ def displaced(
 
 
 def around(block: Block, track: Track, view: View, wheel: Stand, h: jax.Array) -> tuple[Sand, jax.Array]:
-    """The sand around the wheel, and how much the wheel is among it, 0 to 1."""
+    """The sand of the block around the wheel, and how much the wheel is in contact with it, 0 to 1."""
     way = track.way
     touch = _touch(track, wheel, h)
     free, gates = _gates(block.neighbours, wheel, touch, view.holds)
@@ -206,20 +231,21 @@ def around(block: Block, track: Track, view: View, wheel: Stand, h: jax.Array) -
 
 
 def _touch(track: Track, wheel: Stand, h: jax.Array) -> jax.Array:
+    """How much sand touches the wheel in each cell: 1 at the rim and above, 0 from `_TOUCH` spacings below it."""
     reach = spread(_TOUCH * track.way.spacing / track.way.quantum, h)
     return jnp.clip(1 + jnp.maximum(h - wheel.rim, -reach) / reach, 0, 1)
 
 
 def _under(way: Way, wheel: Stand) -> Way:
-    """The way of a tool whose bottom is the rim."""
+    """The leg of a tool whose bottom is the wheel's rim."""
     return replace(way, bottom=wheel.rim * way.quantum)
 
 
 def _gates(neighbours: Neighbours, wheel: Stand, touch: jax.Array, holds: jax.Array) -> tuple[jax.Array, Fluxes]:
-    """The open share of each cell, and how open each link is; `holds` is 1 where a cell can hold sand, in a halo.
+    """The open share of each cell and of each link; `holds` is 1 where a cell can hold sand, with ghost cells.
 
-    A link is as open as the narrower of its cells, times 2 / (1 + narrower / wider), and no more than the wheel's two planes
-    leave of it where they cut it.
+    A link is as open as the narrower of its two cells, times 2 / (1 + narrower / wider). Where one of the wheel's planes
+    cuts the link, the narrower counts at most as what the plane leaves open.
     """
     free = (1 - jnp.minimum(wheel.cover / (1 - NARROW), 1) * touch) * at(holds)
     walls = [
@@ -250,7 +276,10 @@ def carried_back(
     h: jax.Array,
     taken: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Grousers leave a part of what is taken up in the cut behind the wheel, over a quarter of its chord's length."""
+    """The heights and the sand taken up, after grousers set a part of that down in the cut behind the wheel.
+
+    They set it down over a quarter of the chord's length.
+    """
     if track.carried is None:
         return h, taken
     slip, side = jnp.abs(track.slip), track.way.side
@@ -267,7 +296,7 @@ def carried_back(
 
 
 def _left_over(taken: jax.Array, put: jax.Array) -> jax.Array:
-    """What rounding left of `taken` once `put` was put down (quanta), on the highest cell of that."""
+    """The rounding error of the sum of `put` against that of `taken` (quanta), on the highest cell of `put`."""
     # The counts fit their integers or wrap around; their sum is right, since what is left over is small.
     whole = jnp.round(lax.stop_gradient(taken - put)).astype(jnp.int64 if put.dtype == jnp.float64 else jnp.int32)
     cells = put.reshape(-1, *put.shape[2:])

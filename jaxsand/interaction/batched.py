@@ -8,7 +8,6 @@ map comes out as it would alone, up to rounding.
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.rule import PushRule
 from jaxsand.interaction.simulate import Rules, Shaped, lifted, ready, step, windows_for
@@ -27,6 +27,7 @@ from jaxsand.scene.scene import Scene, as_array
 from jaxsand.scene.window import Whole
 
 Loss = Callable[..., Float[Array, ""]]
+Batch = tuple[jax.Array, jax.Array, tuple[Tree, ...]]  # maps [B, H, W], strokes [B, 4], and what else a loss needs
 _GRADIENTS = 32  # the most maps that are differentiated together, on a CPU
 
 
@@ -89,7 +90,7 @@ def value_and_grad_batch(
     loss: Loss,
     height: Float[ArrayLike, "B H W"],
     stroke: Float[ArrayLike, "B 4"],
-    *args: Any,
+    *args: Tree,
     push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
@@ -142,14 +143,14 @@ def value_and_grad_batch(
 
 
 def _batch(
-    program: Callable[..., Any],
+    program: Callable[..., Tree],
     scene: Scene,
-    height: Any,
-    stroke: Any,
-    rules: Any,
+    height: ArrayLike,
+    stroke: ArrayLike,
+    rules: tuple[PushRule | None, Scheme | None, Stop | None],
     chunk: int | None,
-    args: tuple[Any, ...] = (),
-) -> Any:
+    args: tuple[Tree, ...] = (),
+) -> Tree:
     height = as_batch(height)
     stroke = as_array("stroke", stroke, height.dtype)
     if stroke.shape != (height.shape[0], 4):
@@ -157,7 +158,7 @@ def _batch(
     check_chunk(chunk)
     scene, _, rules = ready(scene, height[0], *rules)
 
-    def run(scene: Scene, who: Any) -> Any:
+    def run(scene: Scene, who: slice | np.ndarray) -> Tree:
         batch = jax.tree.map(lambda x: x[who], (height, stroke, args))
         return in_groups(partial(program, scene, rules), batch, _lengths, chunk)
 
@@ -165,19 +166,19 @@ def _batch(
     return in_turns([partial(run, one) for one in scenes], _flagged)
 
 
-def _lengths(batch: Any) -> np.ndarray:
+def _lengths(batch: Batch) -> np.ndarray:
     stroke = np.asarray(batch[1])
     return np.hypot(*(stroke[:, 2:] - stroke[:, :2]).T)
 
 
-def _flagged(out: Any) -> jax.Array:
+def _flagged(out: Tree) -> jax.Array:
     """Which results of a batch say that sand reached the edge of the window."""
     return (out[-1] if isinstance(out, tuple) else out.outcome) & Outcome.WINDOW_EDGE
 
 
 @cache
-def _step_program() -> Any:
-    def run(scene: Scene, rules: Rules, batch: Any) -> Shaped:
+def _step_program() -> Callable[[Scene, Rules, Batch], Shaped]:
+    def run(scene: Scene, rules: Rules, batch: Batch) -> Shaped:
         push, scheme, stop = rules
         pushed = _acted(scene, push, batch)
         settled = relax_batch((scene, scheme, stop, Whole()), pushed.height, chunk=pushed.height.shape[0])
@@ -187,23 +188,23 @@ def _step_program() -> Any:
 
 
 @cache
-def _act_program() -> Any:
-    def run(scene: Scene, rules: Rules, batch: Any) -> Pushed:
+def _act_program() -> Callable[[Scene, Rules, Batch], Pushed]:
+    def run(scene: Scene, rules: Rules, batch: Batch) -> Pushed:
         return _acted(scene, rules[0], batch)
 
     return jax.jit(run, compiler_options=wide_vectors())
 
 
-def _acted(scene: Scene, push: PushRule, batch: Any) -> Pushed:
+def _acted(scene: Scene, push: PushRule, batch: Batch) -> Pushed:
     return jax.vmap(lambda h, s: push.along(scene, h, s.reshape(2, 2))[0])(*batch[:2])
 
 
 @cache
-def _gradient_program(loss: Loss) -> Any:
-    def run(scene: Scene, rules: Rules, batch: Any) -> Any:
+def _gradient_program(loss: Loss) -> Callable[[Scene, Rules, Batch], tuple[jax.Array, ...]]:
+    def run(scene: Scene, rules: Rules, batch: Batch) -> tuple[jax.Array, ...]:
         push, scheme, stop = rules
 
-        def one(height: jax.Array, stroke: jax.Array, args: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+        def one(height: jax.Array, stroke: jax.Array, args: tuple[Tree, ...]) -> tuple[jax.Array, jax.Array]:
             shaped = step(scene, height, stroke, push=push, scheme=scheme, stop=stop)
             return loss(shaped.height, *args), shaped.outcome
 

@@ -20,7 +20,6 @@ that volume is kept as well as floats allow.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +27,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._displacement import Job, contact, settle_around, take, whole
 from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
 from jaxsand.interaction._overflow import Rim, nothing_beyond
@@ -103,14 +103,14 @@ class SwathPush:
         check_whole("push.sweeps", self.sweeps, 0)
         check_rate(scene, "push.rate", self.rate)
 
-    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Any]:
+    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Tree]:
         """Moves the scene's blade along the path; see `PushRule`."""
         return push_swath(scene, height, path, self, record)
 
 
 def push_swath(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SwathPush, record: Record | None = None
-) -> tuple[Pushed, Any]:
+    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 2"], push: SwathPush, record: Record | None = None
+) -> tuple[Pushed, Tree]:
     """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
     scene = replace(scene, window=Whole())
 
@@ -287,7 +287,7 @@ def _heap(
     return heap, volume - placed, gone
 
 
-def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
+def typical_drop(job: Job, weight: Float[Array, "H W"]) -> Float[Array, ""]:
     """The largest stable step between neighbours (m): the bed's, or its weighted mean where it differs from cell to cell."""
     drop = job.bed.drop
     if not drop.ndim:
@@ -296,7 +296,7 @@ def typical_drop(job: Job, weight: jax.Array) -> jax.Array:
     return jnp.where(total > 0, jnp.sum(weight * drop) / jnp.where(total > 0, total, 1), jnp.max(drop))
 
 
-def complete(job: Job, taken: jax.Array, put: jax.Array) -> jax.Array:
+def complete(job: Job, taken: Float[Array, "H W"], put: Float[Array, "H W"]) -> Float[Array, "H W"]:
     """`put` with the rounding error of its sum added to its highest cell, so that it adds up to `taken` exactly."""
     # The counts fit their integers or wrap around; their sum is right, since what is left over is small.
     quanta = jnp.round(lax.stop_gradient(taken - put) / job.flow.quantum)

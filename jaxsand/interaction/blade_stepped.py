@@ -1,11 +1,11 @@
-"""What a blade does to the sand: it is lowered, turned and moved, and the sand around it is kept at rest.
+"""A blade's push in sub-steps: it is lowered, turned and moved, and the sand around it is kept at rest.
 
-The quasi-static limit is that of a tool so slow that the sand is always at rest. The blade advances by sub-steps of a fixed
-part of a spacing; after each, what it newly covers has left along its face's normal (_blade.py) and the sand is brought to
-rest around it (resting.py). When it is lowered, what it covers leaves radially: away from its centre in the blade's own
-proportions, along the gradient of (s / thickness)^2 + (n / width)^2 with s along and n across the blade. At a corner it
-turns in place, by the smaller angle, in sub-steps of an angle; what it sweeps leaves along its faces. A reversal is half a
-turn, to the left.
+In the quasi-static limit a tool is so slow that the sand is always at rest. The blade advances by sub-steps of a fixed part
+of a spacing. In each, the sand that it newly covers is displaced along the normal of its face (_blade.py), and the sand
+around it is brought to rest (resting.py). When the blade is lowered, the sand that it covers is displaced along the gradient
+of (s / thickness)^2 + (n / width)^2, with s along and n across the blade. At a corner the blade turns in place, by the
+smaller angle, in sub-steps of an angle; the sand that it sweeps is displaced along the normals of its faces. A reversal is
+half a turn, to the left.
 
 Source: arXiv:1908.02745, "Tool Interaction"; shares of a cell in place of whole ones make the result continuous in the
 stroke.
@@ -14,14 +14,16 @@ stroke.
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import repeat, repeat_until
+from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
 from jaxsand.interaction._advance import Advance, Rest
 from jaxsand.interaction._block import SPARE, Block, Moving, Way
 from jaxsand.interaction._displacement import Job
@@ -37,15 +39,17 @@ from jaxsand.scene.window import AsNeeded, Window
 if TYPE_CHECKING:
     from jaxsand.interaction.stepped import SteppedPush
 
+Length = TypeVar("Length", float, jax.Array)
+
 
 def push_along(
     scene: Scene,
-    height: jax.Array,
-    path: jax.Array,
+    height: Float[Array, "H W"],
+    path: Float[Array, "n 2"],
     push: "SteppedPush",
     record: Record | None = None,
     rest: Rest = bring_to_rest,
-) -> tuple[Pushed, Any]:
+) -> tuple[Pushed, Tree]:
     """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`.
 
     `rest` is the function that brings the sand to rest after each sub-step.
@@ -67,7 +71,7 @@ def _leg(
     before: Pose | None,
     state: State,
 ) -> State:
-    """Lowers the blade, or turns it from the pose before, and moves it ahead by `length`, as far as that touches the map."""
+    """Lowers the blade, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
     shape, dx, drains = scene.grid.shape, job.bed.spacing, job.bed.rim is not None
     size = near = max(shape)
     if isinstance(scene.window, Window) and max(scene.window.size) < size:
@@ -75,7 +79,7 @@ def _leg(
         near = min(size, scene.window.near or size)
     block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, drains)
     h, lost, moved = state
-    if near < size:  # a traced blade that is larger than the one for which the window was made
+    if near < size:  # a traced blade may be larger than the one for which the window was made
         far = lax.stop_gradient(_far(job.tool.width / dx, job.tool.thickness / dx))
         moved = jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, moved)
     none = no_flux(block.neighbours, drains, jnp.zeros((size, size), h.dtype))
@@ -132,7 +136,7 @@ def with_near(scene: Scene) -> Scene:
     return replace(scene, window=replace(scene.window, near=2 * math.floor(far) + 3))
 
 
-def _known(*leaves: Any) -> list[float] | None:
+def _known(*leaves: ArrayLike) -> list[float] | None:
     """The values as numbers, or None if one of them is traced or an array for many scenes."""
     found = [concrete(x) for x in leaves]
     if any(x is None or x.ndim for x in found):
@@ -140,7 +144,7 @@ def _known(*leaves: Any) -> list[float] | None:
     return [float(x) for x in found if x is not None]
 
 
-def _far(width: Any, thickness: Any) -> Any:
+def _far(width: Length, thickness: Length) -> Length:
     """The largest distance, in cells, from a block's middle to a cell that the blade covers.
 
     It allows for a footprint smoothed over a spacing, and for a block that stays put while the blade moves by a spacing.
@@ -148,8 +152,8 @@ def _far(width: Any, thickness: Any) -> Any:
     return ((width + 1) ** 2 + (thickness + 1) ** 2) ** 0.5 / 2 + 1
 
 
-_TOLERANCE = 1e-3  # as settling leaves it by default: slopes above repose, and spacings by which sand may move at an edge
-_LEAST = 1.5  # times a window's width: the map's, for the window to save work
+_TOLERANCE = 1e-3  # a window's tolerance: the slope above repose that settling leaves by default
+_LEAST = 1.5  # a map's width over a window's, from which on the window saves work
 
 
 def windows_for(scene: Scene, times: float = 1) -> Iterator[Scene]:

@@ -1,26 +1,26 @@
-"""Sand kept at rest around a tool that moves slowly.
+"""Brings sand to rest around a tool that moves slowly, by proximal gradient steps.
 
-In the quasi-static limit sand flows only over links that stand at repose, and no slope exceeds it. Over a sub-step in which
-a tool changes the heights to h, that is (Prigozhin's sandpile, doi:10.1016/0009-2509(96)00259-5, one implicit step)
+In the quasi-static limit sand flows only over links at repose, and no slope exceeds repose. For a sub-step in which a tool
+changes the heights to h, the limit is (one implicit step of Prigozhin's model, doi:10.1016/0009-2509(96)00259-5)
 
     h' = h + G f,   f = argmin over f of |h + G f|^2 / 2 + sum over links of m |f|,
 
-m the largest stable step of a link, f what crosses it, G f what cells gain: h' is the map nearest to h within repose. With D
-the steps over links, proximal gradient steps
+where m is the largest stable step of a link, f the flux over it and G f what cells gain: h' is the map nearest to h whose
+slopes are within repose. With D the steps over links, the proximal gradient steps
 
     f <- S(f + r w D (h + G f), r w m),   S(z, t) = z - clip(z, -t, t)
 
-lead there from any start, since r w is below 2 / |G|^2 (the limit of a sweep of settling). Unlike a sweep of settling,
-such a step takes back what has crossed a link too many times. That allows a good guess to begin with: around a tool that
-moves steadily the sand does too. So every sub-step starts from the fluxes of the last one, and a few steps suffice, however
-far the heap reaches. Isotropic sand has a flux along each of the four one-sided gradients of a cell, which S shortens to
-length.
+converge to it from any start, since r w is below 2 / |G|^2, the limit of a sweep of settling. Unlike a sweep of settling,
+such a step can take back a flux that was too large, and so can start from a guess. The guess is the flux of the last
+sub-step: around a tool that moves steadily, fluxes change little. Then a few steps suffice, however far the heap reaches.
+Isotropic sand has a flux along each of the four one-sided gradients of a cell, whose length S shortens.
 
-The weight w of a link is how open it is. A cell of which the share o is open rises by 1 / o of what it gains, so that steps
-are stable if for every f the sum over cells of (sum of f)^2 / o is at most 2 sum of f^2 / (r w); with n links to a cell, all
-open, that is r n <= 1, and for others it holds if 2 / w >= 1 / o + 1 / o', the two ends': w is their harmonic mean at most.
-Isotropic sand couples two links in a gradient, which must have one weight: with each arm felt and moved by the same part a,
-1 but where a link is nearly closed, that is the lesser of the two w / a^2. Fluxes are whole quanta (ghost_cells.py).
+The weight w of a link is its open share. A cell with the open share o rises by 1 / o of what it gains. Steps are stable if
+for every f the sum over cells of (sum of f)^2 / o is at most the sum over links of 2 f^2 / (r w). With n open links to a
+cell this is r n <= 1. Else it holds if 2 / w >= 1 / o + 1 / o' for the two ends of each link: w is at most their harmonic
+mean. Isotropic sand couples two links in a gradient, which need one common weight: both the step and the flux of a link are
+multiplied by a factor a, below 1 only where the link is nearly closed, and the weight is the lesser of the two links' w /
+a^2. Fluxes are whole quanta (ghost_cells.py).
 """
 
 from dataclasses import dataclass, field
@@ -28,16 +28,18 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxsand.interaction.stencil import both_ends, inner, net, outer, rises
 from jaxsand.relaxation.flux import Fluxes, ends
 from jaxsand.relaxation.ghost_cells import nearest, truncate
 from jaxsand.scene.grid import Neighbours, links
 
-_FELT = 0.25  # an arm of a gradient counts in full once it is so far open
-_CALM = 0.6  # of the rate: beyond this, gradients that start from a guess overshoot, now and then without end
-_GUESSED = 0.07  # and so does a guess: the less, the closer to the limit, and the more a stroke moved by a hair changes
-_RUNS_OFF = 5  # times as fast as over a link: nothing lies beyond a rim that it would have to share with
+Map = Float[Array, "m m ..."]  # a block, or one for each map of a batch in the last axis
+_FELT = 0.25  # the open share from which on a link counts in full in a gradient
+_CALM = 0.6  # factor of the rate of isotropic sand, which overshoots at the full rate when it starts from a guess
+_GUESSED = 0.07  # the open share from which on a guess counts in full; less is closer to the limit but less smooth
+_RUNS_OFF = 5  # factor of the rate over a rim, beyond which no cell has to be kept stable
 
 
 @jax.tree_util.register_dataclass
@@ -45,26 +47,33 @@ _RUNS_OFF = 5  # times as fast as over a link: nothing lies beyond a rim that it
 class Sand:
     """A block of sand around a tool; heights are in quanta.
 
-    `gates` say how open each link is, [m, m + 1] and so on as in flux.py; `open` [m, m] is the share of each cell that the
-    tool leaves, above whose `bottom` the sand stands higher by `stretch`; `drop` is the largest stable step of a straight
-    link; over `sides` [m, m] sand runs off where it stands above `rim` (both None where nothing drains).
+    Attributes:
+        gates: open share of each link, in the shapes of flux.py.
+        open: open share of each cell [m, m].
+        stretch: how much higher sand stands in partly covered cells: at h + stretch (h - bottom).
+        bottom: height of the tool's bottom, a scalar or [m, m].
+        drop: largest stable step of a straight link.
+        sides: number of sides over which each cell drains [m, m], or None where the edge is closed.
+        rim: height of the draining rim, or None.
+        neighbours: 4, 8 or "isotropic".
     """
 
     gates: Fluxes
-    open: jax.Array
-    stretch: jax.Array
-    bottom: jax.Array
-    drop: jax.Array
-    sides: jax.Array | None
-    rim: jax.Array | None
+    open: Map
+    stretch: Map
+    bottom: Map | Float[Array, "..."]
+    drop: Map | Float[Array, "..."]
+    sides: Map | None
+    rim: Float[Array, "..."] | None
     neighbours: Neighbours = field(metadata={"static": True})
 
-    def surface(self, h: jax.Array) -> jax.Array:
+    def surface(self, h: Map) -> Map:
+        """The height at which the sand of each cell stands in its open share."""
         return h + self.stretch * jnp.where(h > self.bottom, h - self.bottom, 0)
 
 
-def no_flux(neighbours: Neighbours, drains: bool, h: jax.Array) -> Fluxes:
-    """No flux in a block of heights [m, m]."""
+def no_flux(neighbours: Neighbours, drains: bool, h: Map) -> Fluxes:
+    """Fluxes of 0 for a block of heights [m, m]."""
     if neighbours == "isotropic":
         maps = [jnp.zeros_like(h)] * 8
     else:
@@ -73,14 +82,14 @@ def no_flux(neighbours: Neighbours, drains: bool, h: jax.Array) -> Fluxes:
     return (*maps, jnp.zeros_like(h)) if drains else tuple(maps)
 
 
-def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess: Fluxes) -> tuple[jax.Array, Fluxes]:
-    """The heights after so many proximal steps from a guess, and the fluxes that led there."""
+def bring_to_rest(sand: Sand, rate: Float[Array, "..."], sweeps: int, h: Map, guess: Fluxes) -> tuple[Map, Fluxes]:
+    """The heights after a number of proximal steps that start from a guess of the fluxes, and the fluxes."""
     model: Links | _Gradients = Links(sand, rate)
     if sand.neighbours == "isotropic":
         model = _Gradients(sand, _CALM * rate)
 
     def stage(_: jax.Array, flux: Fluxes) -> Fluxes:
-        # All that is the same for every step goes through the barrier too: XLA would compute more beforehand, and store it.
+        # The model passes the barrier too: XLA would else compute parts of the step beforehand and store them.
         here, flux = lax.optimization_barrier((model, flux))
         return lax.optimization_barrier(here.shrink(flux, outer(here.sand.surface(h + here.gained(flux)))))
 
@@ -91,23 +100,23 @@ def bring_to_rest(sand: Sand, rate: jax.Array, sweeps: int, h: jax.Array, guess:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Links:
-    """Sand that flows in pairs: one flux to a link, in whole quanta."""
+    """The proximal steps with 4 or 8 neighbours: one flux for each link, in whole quanta."""
 
     sand: Sand
     rate: jax.Array
 
     @property
     def factors(self) -> list[jax.Array]:
-        """What a rise drives over an open link in each direction."""
+        """The flux over an open link per step of the surface, for each direction."""
         return [self.rate / length for _, _, length in links(self.sand.neighbours)]
 
     @property
     def most(self) -> jax.Array:
-        """What the largest stable rise would drive, the same in all directions."""
+        """The flux that the largest stable step would drive, the same in all directions."""
         return self.rate * self.sand.drop
 
     def shrink(self, flux: Fluxes, around: jax.Array) -> Fluxes:
-        """The fluxes after a step, where the surface, in a halo, is `around`."""
+        """The fluxes after one proximal step; `around` is the surface with ghost cells."""
         out, neighbours = [], self.sand.neighbours
         thresholds = [self.most] * len(self.sand.gates)
         if self.sand.drop.ndim == around.ndim:
@@ -128,13 +137,13 @@ class Links:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class _Gradients:
-    """Isotropic sand: a vector to each of a cell's four one-sided gradients, along x and y in turn."""
+    """The proximal steps of isotropic sand: fluxes along x and y for each of a cell's four one-sided gradients, in turn."""
 
     sand: Sand
     rate: jax.Array
 
     def shrink(self, y: Fluxes, around: jax.Array) -> Fluxes:
-        """The fluxes after a step, where the surface, in a halo, is `around`."""
+        """The fluxes after one proximal step; `around` is the surface with ghost cells."""
         arms = [d * _felt(gate) for d, gate in zip(rises("isotropic", around), self.sand.gates, strict=True)]
         across, up = _both_ends(arms)
         of_x, of_y = _both_ends([_weight(gate) for gate in self.sand.gates])
@@ -169,17 +178,17 @@ def _both_ends(arms: list[jax.Array]) -> tuple[tuple[jax.Array, jax.Array], tupl
 
 
 def _felt(gate: jax.Array) -> jax.Array:
-    """How far an arm of a gradient counts, a."""
+    """The factor a of a link's step and flux in a gradient, from its open share."""
     return jnp.minimum(gate / _FELT, 1)
 
 
 def _weight(gate: jax.Array) -> jax.Array:
-    """w / a^2, at most 1; what a closed link would have is of no account."""
+    """The weight w / a^2 of a link in a gradient, at most 1; for a closed link, whose a is 0, it has no effect."""
     return jnp.where(gate < _FELT, jnp.minimum(_FELT**2 / jnp.maximum(gate, _FELT**2), 1), gate)
 
 
 def where_open(neighbours: Neighbours, gates: Fluxes, guess: Fluxes) -> Fluxes:
-    """A guess of what crosses links as far as they are open, in whole quanta."""
+    """A guess of fluxes, reduced over links that are nearly closed, in whole quanta."""
     if neighbours == "isotropic":
         across, up = _both_ends(list(gates))
         gates = tuple(ends[k] for n in range(4) for ends, k in ((across, n // 2), (up, n % 2)))
@@ -187,7 +196,7 @@ def where_open(neighbours: Neighbours, gates: Fluxes, guess: Fluxes) -> Fluxes:
 
 
 def _over(sand: Sand, rate: jax.Array, y: jax.Array, s: jax.Array) -> jax.Array:
-    """What runs off over the rim, half a spacing beyond the outer cells: at each step nearly all that stands too high."""
+    """The flux over the rim after one step: it grows by nearly all the sand that stands above repose against the rim."""
     assert sand.sides is not None
     assert sand.rim is not None
     part = jnp.minimum(_RUNS_OFF * rate, 0.9) * sand.open
@@ -196,6 +205,7 @@ def _over(sand: Sand, rate: jax.Array, y: jax.Array, s: jax.Array) -> jax.Array:
 
 
 def _gained(sand: Sand, flux: Fluxes) -> jax.Array:
+    """What each cell gains from the fluxes over its links, less what it loses over the rim."""
     if sand.sides is None:
         return net(sand.neighbours, flux)
     return net(sand.neighbours, flux[:-1]) - flux[-1]

@@ -1,9 +1,10 @@
 """How a tool moves the sand: what every push rule offers."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Array, Float
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed, Record
 from jaxsand.scene.scene import Scene
 
@@ -33,7 +34,7 @@ class PushRule(Protocol):
         height: Float[Array, "H W"],
         path: Float[Array, "n 2"],
         record: Record | None = None,
-    ) -> tuple[Pushed, Any]:
+    ) -> tuple[Pushed, Tree]:
         """Lowers the tool at path[0], moves it along the legs of the path (m) and lifts it; the sand is not settled.
 
         It must be pure and traceable, and keep the volume: what leaves one cell arrives in others.

@@ -4,14 +4,15 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TypeVar
 
 import jax
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-from jaxsand.interaction._path import Pushed
+from jaxsand.autodiff.while_loop import Tree
+from jaxsand.interaction._path import Pushed, Record
 from jaxsand.interaction.blade_stepped import with_near
 from jaxsand.interaction.rule import PushRule
 from jaxsand.interaction.stepped import SteppedPush
@@ -24,6 +25,7 @@ from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
 
 Rules = tuple[PushRule, Scheme, Stop]
+Result = TypeVar("Result", Pushed, "Shaped", tuple["Shaped", jax.Array])
 _SURE = 1.5  # times the width of a window that a stroke asks for, where there is no second try
 
 
@@ -268,7 +270,9 @@ def rollout(
     return _as_needed(lambda scene, _: _rollout(scene, height, strokes, rules), scene, rules, (height, strokes))
 
 
-def _as_needed(run: Callable[[Scene, Whole | Window], Any], scene: Scene, rules: Rules, arrays: tuple[Any, Any]) -> Any:
+def _as_needed(
+    run: Callable[[Scene, Whole | Window], Result], scene: Scene, rules: Rules, arrays: tuple[jax.Array, jax.Array]
+) -> Result:
     """The result of `run(scene, settling window)` in the smallest window whose edge the sand does not reach.
 
     While values are traced there is one try, in a window that is wide enough for most strokes.
@@ -414,9 +418,9 @@ def _follow(
     height: jax.Array,
     path: jax.Array,
     rules: Rules,
-    record: Any = None,
+    record: Record | None = None,
     window: Whole | Window | None = None,
-) -> tuple[Shaped, Any]:
+) -> tuple[Shaped, Tree]:
     push, scheme, stop = rules
     pushed, frames = push.along(scene, height, path, record)
     return lifted(pushed, relax(scene, pushed.height, scheme, stop, Whole() if window is None else window)), frames

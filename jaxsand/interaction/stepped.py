@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 from jaxtyping import Array, Float
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed, Record
 from jaxsand.interaction.blade_stepped import push_along, windows_for
 from jaxsand.interaction.wheel_stepped import roll_along
@@ -61,7 +61,7 @@ class SteppedPush:
         check_whole("push.sweeps", self.sweeps, 0)
         check_rate(scene, "push.rate", self.rate)
 
-    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Any]:
+    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Tree]:
         """Moves the scene's tool along the path; see `PushRule`."""
         move = roll_along if isinstance(scene.tool, Wheel) else push_along
         return move(scene, height, path, self, record)

@@ -12,12 +12,13 @@ Source: Pavlov & Johnson, ICRA 2019, restated in wheel_trench.py.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._displacement import Job, whole
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._slices import hat, wedge
@@ -62,14 +63,14 @@ class SplitPush:
                 f"push: got SplitPush for a {type(scene.tool).__name__}; SplitPush() is for a Wheel, SteppedPush() for both"
             )
 
-    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Any]:
+    def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Tree]:
         """Moves the scene's wheel along the path; see `PushRule`."""
         return push_split(scene, height, path, self, record)
 
 
 def push_split(
-    scene: Scene, height: jax.Array, path: jax.Array, push: SplitPush, record: Record | None = None
-) -> tuple[Pushed, Any]:
+    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 2"], push: SplitPush, record: Record | None = None
+) -> tuple[Pushed, Tree]:
     """Moves the wheel along the legs of `path` [n, 2] (m); see `along_legs`."""
     scene = replace(scene, window=Whole())
 
@@ -139,7 +140,7 @@ def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax
     It is sinkage (1 - x^2), middle x^2 + flanks x^3 = behind, by Newton's method, whose last step carries the derivative.
     """
 
-    def newton(_: Any, x: jax.Array) -> jax.Array:
+    def newton(_: int, x: jax.Array) -> jax.Array:
         steep = 2 * middle * x + 3 * flanks * x * x
         return x - (middle * x * x + flanks * x**3 - behind) / jnp.where(steep > 0, steep, 1)
 

@@ -1,14 +1,14 @@
-"""What a wheel does to the sand: it is lowered, turned and moved at its sinkage, and the sand around it is kept at rest.
+"""A wheel's push in sub-steps: it is lowered, turned and moved at its sinkage, and the sand around it is kept at rest.
 
-As for a blade (blade_stepped.py): the wheel advances by sub-steps of a fixed part of a spacing; after each, what it
-newly covers has left it (_wheel.py) and the sand is brought to rest around it (resting.py). When it is lowered, what it
-covers leaves radially, in the proportions of its chord and width. At a corner it turns in place, by the smaller angle,
-in sub-steps of an angle; what it sweeps leaves along its axle. Sand under the wheel is handed on by up to four cells in
-a sub-step; what is on its way, one or two percent of all that is displaced, waits under the wheel.
+It proceeds as a blade's push does (blade_stepped.py): in each sub-step the sand that the wheel newly covers is displaced
+(_wheel.py), and the sand around it is brought to rest (resting.py). When the wheel is lowered, sand is displaced along the
+gradient of (along / chord)^2 + (aside / width)^2. At a corner it turns in place, by the smaller angle, in sub-steps of an
+angle; the sand that it sweeps is displaced along its axle. Sand under the wheel moves on by up to four cells in a sub-step;
+one or two percent of all that is displaced waits under the wheel.
 
-Derivatives by the height, the sinkage and, at oblique angles, the width are of use; those by the stroke's place and the slip
-angle, and by the width of a wheel that runs along its plane, are those of a map that is rough on the scale of a cell's share
-along its flanks: take finite differences over a cell, or `SplitPush`.
+Derivatives by the height, by the sinkage and, at oblique slip angles, by the width are useful. Derivatives by the stroke and
+the slip angle, and by the width of a wheel that runs along its plane, are not: along the wheel's flanks the map depends on
+the shares of single cells, so that it is rough on that scale. Take finite differences over a cell there, or `SplitPush`.
 
 Source: arXiv:1908.02745, "Tool Interaction", where sand leaves in the direction of travel; at slip angles below the angle of
 repose and above its complement the two agree.
@@ -16,12 +16,13 @@ repose and above its complement the two agree.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import repeat, repeat_until
+from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
 from jaxsand.interaction._block import Block, Moving, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, over_the_map, turn_between
@@ -37,8 +38,8 @@ if TYPE_CHECKING:
 
 
 def roll_along(
-    scene: Scene, height: jax.Array, path: jax.Array, push: "SteppedPush", record: Record | None = None
-) -> tuple[Pushed, Any]:
+    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 2"], push: "SteppedPush", record: Record | None = None
+) -> tuple[Pushed, Tree]:
     """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
@@ -50,7 +51,7 @@ def roll_along(
 def _leg(
     scene: Scene, push: "SteppedPush", job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State
 ) -> State:
-    """Lowers the wheel, or turns it from the pose before, and moves it ahead by `length`, as far as that touches the map."""
+    """Lowers the wheel, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
     shape, drains = scene.grid.shape, job.bed.rim is not None
     size = max(shape)
     if isinstance(scene.window, Window):
@@ -81,7 +82,7 @@ def _leg(
 
 
 def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
-    """A leg in spacings, at the angle by which the wheel turned to get here."""
+    """A leg of the wheel in spacings; `angle` is the turn in place before it (rad)."""
     dx, wheel, drop, rim = job.bed.spacing, job.tool, job.bed.drop, job.bed.rim
     chord = half_chord(wheel)
     way = Way(

@@ -1,9 +1,9 @@
-"""How a scheme marches: groups of sweeps until the map is still, on one grid."""
+"""Integrates the flow of sand on one grid: groups of sweeps until the map is still."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -12,29 +12,40 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
 from jaxsand.relaxation._rkl import Surges
-from jaxsand.relaxation.flux import Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
 from jaxsand.relaxation.ghost_cells import Bed, Lost, grain, truncate
 from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.relaxation.sweep import Flow, Sweep, apply
 from jaxsand.scene.grid import links
 
-Sand = tuple[jax.Array, Lost]  # a map with halo, and what it lost over the rim
+Sand: TypeAlias = tuple[jax.Array, Lost]  # a map with ghost cells, and what it lost over the rim
+State: TypeAlias = Sand | tuple[jax.Array, Lost, Fluxes]
+Rate: TypeAlias = jax.Array | float
+Limits: TypeAlias = tuple[jax.Array, jax.Array]  # the tolerance, and the slope per quantum that floats can still move
+Params: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, *tuple[Rate, ...]]
+
+
+Swept: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, Rate]
 
 
 @dataclass(frozen=True)
 class March:
-    """Sweeps in groups of `interval` until no slope exceeds repose by more than a tolerance.
+    """A loop over groups of `interval` sweeps, which ends when no slope exceeds repose by more than a tolerance.
 
-    `begin(sand)` is the state before the first group, whose first two members are the sand; `body(params, k, state)` the one
-    after group k; `done(params, k, state)` says whether to stop before group k; `between(k)` whether the sand alone is all
-    the state there.
+    Attributes:
+        begin: from the sand to the state before the first group, whose first two members are the sand.
+        body: from params, k and the state before group k to the state after it.
+        done: from params, k and the state, whether to stop before group k.
+        between: whether before group k the state holds nothing but the sand, so that the loop can be restarted there.
+        params: what `body` and `done` depend on.
+        interval: number of sweeps in a group.
     """
 
-    begin: Callable[[Sand], Any]
+    begin: Callable[[Sand], State]
     body: Step
-    done: Callable[..., Any]
-    between: Callable[[jax.Array], Any]
-    params: Any
+    done: Callable[..., jax.Array]
+    between: Callable[[jax.Array], jax.Array]
+    params: Params
     interval: int
 
     def run(self, groups: int, sand: Sand) -> tuple[Sand, jax.Array]:
@@ -50,42 +61,41 @@ def march(
     tolerance: jax.Array | None,
     interval: int,
 ) -> March:
-    """How the scheme marches on this bed; without a tolerance it is never done.
+    """The loop of a scheme on this bed; without a tolerance it runs to its bound.
 
-    The quantum follows the largest height down, so that a spike leaves sand as smooth as its remains allow.
+    Each group cuts fluxes to quanta of the heights that are left, so that a spike that wears off does not leave rough sand.
     """
-    begin: Any
-    body: Any
-    done: Any
-    between: Any
-    rate: Any
+    begin: Callable[[Sand], State]
+    body: Step
+    done: Callable[..., jax.Array]
+    between: Callable[[jax.Array], jax.Array]
+    rate: Rate
+    limits: Limits | None = None
     if isinstance(scheme, Schedule):
         begin = partial(_with_momentum, bed)
         body = Surges(scheme, interval)
         rate = float(scheme.rates[-1])
         done = partial(_still_after_a_step, scheme, interval)
         between = partial(_between_steps, scheme, interval)
-        params: Any = (bed, around, tolerance)
     else:
         begin = _as_it_is
         body = Plain(partial(_pairs if isinstance(scheme, Pairwise) else _sweeps, interval))
         rate = scheme.share / 2 if isinstance(scheme, Pairwise) else scheme.rate
         done, between = _still, _always
-        params = (bed, around, tolerance, rate)
     if tolerance is None:
         done = _never
     else:  # below this slope every flux is cut to nothing
         quanta = 4 if isinstance(scheme, Pairwise) and bed.rim is not None else 2
-        floor = lax.stop_gradient(quanta / (rate * bed.spacing))
-        params = (*params[:2], (tolerance, floor), *params[3:])
+        limits = (tolerance, lax.stop_gradient(quanta / (rate * bed.spacing)))
+    params: Params = (bed, around, limits) if isinstance(scheme, Schedule) else (bed, around, limits, rate)
     return March(begin, body, done, between, params, interval)
 
 
-def _with_momentum(bed: Bed, sand: Sand) -> Any:
+def _with_momentum(bed: Bed, sand: Sand) -> State:
     return (*sand, fluxes_zero(bed, sand[0]))
 
 
-def _as_it_is(sand: Sand) -> Any:
+def _as_it_is(sand: Sand) -> State:
     return sand
 
 
@@ -93,24 +103,26 @@ def _always(k: jax.Array) -> jax.Array:
     return jnp.ones((), bool)
 
 
-def still(bed: Bed, around: Nothing | Partial, limits: tuple[jax.Array, jax.Array], u: jax.Array) -> jax.Array:
-    """Whether no slope exceeds repose by more than the tolerance, or than the floats can move."""
+def still(bed: Bed, around: Nothing | Partial, limits: Limits, u: jax.Array) -> jax.Array:
+    """Whether no slope exceeds repose by more than the tolerance, or by more than what floats can still move."""
     tolerance, floor = limits
     if bed.neighbours == "isotropic":  # the larger part of a gradient moves at least 1/(4 sqrt(2)) of its excess
         floor = 3 * floor
     return worst_excess(bed, u, around) <= jnp.maximum(tolerance, floor * grain(bed, u))
 
 
-def _never(params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _never(params: Params, k: jax.Array, state: State) -> jax.Array:
     return jnp.zeros((), bool)
 
 
-def _still(params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _still(params: tuple[Bed, Nothing | Partial, Limits, *tuple[Rate, ...]], k: jax.Array, state: State) -> jax.Array:
     bed, around, limits = params[:3]
     return still(bed, around, limits, state[0])
 
 
-def _still_after_a_step(plan: Schedule, interval: int, params: Any, k: jax.Array, state: Any) -> jax.Array:
+def _still_after_a_step(
+    plan: Schedule, interval: int, params: tuple[Bed, Nothing | Partial, Limits], k: jax.Array, state: State
+) -> jax.Array:
     return _between_steps(plan, interval, k) & _still(params, k, state)
 
 
@@ -118,19 +130,20 @@ def _between_steps(plan: Schedule, interval: int, k: jax.Array) -> jax.Array:
     return jnp.any(jnp.asarray(plan.starts) == k * interval)
 
 
-def _sweeps(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
+def _sweeps(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
     bed, around, _, rate = params
     flow = Flow(jnp.asarray(rate), grain(bed, state[0]))
     return repeat(Sweep(), interval, (bed, flow, around), state)
 
 
-def _pairs(interval: int, params: Any, k: jax.Array, state: Any) -> Any:
+def _pairs(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
     bed, _, _, half = params
     flow = Flow(jnp.asarray(half), grain(bed, state[0]))
     return repeat(_EACH_PAIR, interval, (bed, flow), state)
 
 
 def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
+    """One sweep of `Pairwise`: in each direction every other pair, then the rest."""
     scale = flow.rate / flow.quantum
     for chosen, link in enumerate(links(bed.neighbours)):
         for colour in (0, 1):

@@ -1,4 +1,8 @@
-"""Coarse-to-fine settling: see `Multilevel`. On every grid a map is volume per cell area, which whole quanta keep exact."""
+"""Multigrid settling; see `Multilevel`.
+
+On every grid a map holds volume per cell area, in whole quanta, so that volume is exact. Where the number of rows or columns
+is odd, the last coarse cells contain sand in a part of their area only (`Partial`).
+"""
 
 from dataclasses import replace
 
@@ -26,13 +30,16 @@ def descend(
     sand: Sand,
     level: int = 0,
 ) -> tuple[Sand, jax.Array]:
-    """Settles on this grid and the coarser ones: the sand, and the sweeps in units of this grid's."""
+    """Settles on this grid and the coarser ones.
+
+    Returns the sand, and the number of sweeps, where four of the next coarser grid count as one of this.
+    """
     rows, columns = (n - 2 for n in sand[0].shape)
     early = schedule(scheme.steps(), limit, bound, interval, scheme.handover / 4 if level else 0.0)
     narrow = max(rows, columns) if 1 in (rows, columns) else min(rows, columns)
     if narrow < 2 * scheme.coarsest:
         return march(bed, cells, early, tolerance, interval).run(bound // interval, sand)
-    # To the first end of a group past the handover that is also the end of a step.
+    # Up to the first group past the handover that ends with the end of a step.
     ends = early.starts[(early.times >= scheme.handover) & (early.starts % interval == 0)]
     groups = int(ends[0]) // interval if ends.size else bound // interval
     sand, taken = march(bed, cells, early, tolerance, interval).run(groups, sand)
@@ -40,7 +47,7 @@ def descend(
     cut = grain(bed, sand[0])
     wide_bed, wide_cells, wide = _widen(bed, cells, cut, at(sand[0]))
     begun = (halo(wide), nothing_lost(wide_bed, wide))
-    # Stiller than asked for, lest rounding on the finer grid set the sand in motion everywhere.
+    # To half the tolerance, or rounding on the finer grid would set the sand in motion everywhere.
     stiller = tolerance if level else tolerance / 2
     (ended, lost), more = descend(wide_bed, wide_cells, scheme, limit, stiller, bound, interval, begun, level + 1)
     early_end = still(bed, cells, (tolerance, 2 / (scheme.safety * limit * bed.spacing)), sand[0])
@@ -74,17 +81,21 @@ def _sum(parts: list[jax.Array]) -> jax.Array:
 
 
 def _quarters(x: jax.Array) -> list[jax.Array]:
-    """The four cells of each coarse one; beyond an odd edge there is nothing."""
+    """The four cells of each coarse cell, as four maps; 0 beyond an odd edge."""
     x = jnp.pad(x, ((0, x.shape[0] % 2), (0, x.shape[1] % 2)))
     return [x[i::2, j::2] for i in (0, 1) for j in (0, 1)]
 
 
 def _inject(x: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Every coarse cell's value in its four fine cells."""
     return jnp.repeat(jnp.repeat(x, 2, 0), 2, 1)[: shape[0], : shape[1]]
 
 
 def _spread(cells: Cells, cut: jax.Array, change: jax.Array, volume: jax.Array) -> jax.Array:
-    """A change of coarse cells for the fine ones: in whole quanta of the same sum, linear where cells are whole."""
+    """A change on the coarse grid, interpolated to the fine grid; in whole quanta, and with the same volume.
+
+    Linear where cells are whole; constant in each coarse cell elsewhere.
+    """
     rows, columns = volume.shape
     whole_cell = ~jnp.isnan(volume)
     if isinstance(cells, Nothing):
@@ -115,7 +126,7 @@ def _spread(cells: Cells, cut: jax.Array, change: jax.Array, volume: jax.Array) 
 
 
 def start(scheme: Multilevel, marked: jax.Array) -> Cells:
-    """The cells of the finest grid: Nothing special where every cell of every grid is made of four."""
+    """The cells of the finest grid: `Nothing` if each cell of every grid consists of four finer ones, else `Partial`."""
     rows, columns = marked.shape
     odd = 1 in marked.shape
     while min(rows, columns) >= 2 * scheme.coarsest:

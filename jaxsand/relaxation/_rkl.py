@@ -1,33 +1,38 @@
-"""Super-time-stepping as a step of a loop: sweeps with momentum, and their derivative from a byte a cell and sweep."""
+"""RKL stages as steps of a loop: sweeps with momentum, and derivatives that store one byte for each cell and sweep."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import DTypeLike
 
-from jaxsand.autodiff.while_loop import Plain, repeat, split
+from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint as adjoint
-from jaxsand.relaxation.flux import Nothing, Partial
-from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo
+from jaxsand.relaxation.flux import Fluxes, Nothing, Partial
+from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, halo
 from jaxsand.relaxation.schemes import Schedule
 from jaxsand.relaxation.sweep import Flow, surge
+
+Params: TypeAlias = tuple[Bed, Nothing | Partial, Tree]
+Pulled: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array]]  # cotangents of heights, fluxes, stable steps
+State: TypeAlias = tuple[jax.Array, Lost, Fluxes]  # a map with ghost cells, its losses, and what links moved last (m)
 
 
 @dataclass(frozen=True)
 class Surges:
-    """Group k of `interval` sweeps of a schedule; `params` are the bed, the cells and limits that it does not use.
+    """A group of `interval` RKL stages of a schedule. `params` are the bed, the cells, and limits that it does not use.
 
-    Where sand flows in pairs over no rim it leaves two bits for each link and sweep on the tape, from which
-    flux_adjoint.py tells the derivative; elsewhere the state before the group, fluxes included.
+    With 4 or 8 neighbours and a closed edge it records two bits for each link and stage, from which flux_adjoint.py computes
+    the derivative. Else it records the state before the group, and JAX differentiates it.
     """
 
     plan: Schedule
     interval: int
     tape: int = 16
 
-    def __call__(self, params: Any, k: jax.Array, state: Any) -> Any:
+    def __call__(self, params: Params, k: jax.Array, state: State) -> State:
         bed, around, _ = params
         rates, momenta = self._stages(k, state[0].dtype)
         cut = grain(bed, state[0])
@@ -36,14 +41,14 @@ class Surges:
         u, lost, last = repeat(_SURGE, self.interval, (bed, around, rates, momenta, cut), state)
         return u, lost, tuple(m * cut for m in last)
 
-    def recorded(self, params: Any, k: jax.Array, state: Any) -> tuple[Any, Any]:
+    def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, Tree]:
         bed, around, _ = params
         if not _by_links(bed):
             return Plain(self).recorded(params, k, state)
         rates, momenta = self._stages(k, state[0].dtype)
         cut = grain(bed, state[0])
 
-        def stage(i: jax.Array, carry: Any) -> Any:
+        def stage(i: jax.Array, carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
             state, codes = carry
             word = lax.dynamic_index_in_dim(codes, i // 4, keepdims=False)
             code = adjoint.active(bed, _surface(around, state[0])) << (8 * (i % 4)).astype(jnp.int32)
@@ -56,7 +61,7 @@ class Surges:
         (u, lost, last), codes = lax.fori_loop(0, self.interval, stage, ((u, lost, tuple(m / cut for m in last)), codes))
         return (u, lost, tuple(m * cut for m in last)), codes
 
-    def push(self, params: Any, k: jax.Array, record: Any, dparams: Any, dstate: Any) -> Any:
+    def push(self, params: Params, k: jax.Array, record: Tree, dparams: Tree, dstate: State) -> State:
         bed, around, _ = params
         if not _by_links(bed):
             return Plain(self).push(params, k, record, dparams, dstate)
@@ -65,7 +70,7 @@ class Surges:
         weights = adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
         dyields = jax.jvp(lambda drop: adjoint.yields(replace(bed, drop=drop)), (bed.drop,), (dbed.drop,))[1]
 
-        def stage(i: jax.Array, carry: Any) -> Any:
+        def stage(i: jax.Array, carry: tuple[jax.Array, Fluxes]) -> tuple[jax.Array, Fluxes]:
             dh, last = carry
             code, moved = _code(record, i), []
             for n, (step, dm, w) in enumerate(
@@ -80,7 +85,7 @@ class Surges:
         dh, last = lax.fori_loop(0, self.interval, stage, (at(dstate[0]), last))
         return halo(dh, 0.0), None, adjoint.from_lattice(bed, last)
 
-    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
+    def pull(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
         bed, around, _ = params
         if not _by_links(bed):
             return Plain(self).pull(params, k, record, cotangent)
@@ -89,7 +94,7 @@ class Surges:
         lengths = adjoint.opened(bed, None)
         stretch = weights if bed.drop.ndim else [w / v for w, v in zip(weights, lengths, strict=True)]
 
-        def stage(j: jax.Array, carry: Any) -> Any:
+        def stage(j: jax.Array, carry: Pulled) -> Pulled:
             i = self.interval - 1 - j
             gain, last, tilt = carry
             again = jnp.where(j > 0, momenta[jnp.minimum(i + 1, self.interval - 1)], 1)
@@ -105,7 +110,7 @@ class Surges:
                 for n, (y, s) in enumerate(zip(back, stretch, strict=True))
             ]
             if not bed.drop.ndim:
-                signed = [sum(signed)]
+                signed = [jnp.asarray(sum(signed))]
             tilt = [t + rate * s for t, s in zip(tilt, signed, strict=True)]
             return gain + rate * _ease(around, adjoint.gains(bed, tuple(onward))), back, tilt
 
@@ -119,8 +124,8 @@ class Surges:
         floats = split((replace(dparams[0], drop=drop), *dparams[1:]))[0]
         return floats, (halo(gain, 0.0), None, adjoint.from_lattice(bed, tuple(-p for p in last)))
 
-    def _stages(self, k: jax.Array, dtype: Any) -> tuple[jax.Array, jax.Array]:
-        """The rates and the momenta of the group's sweeps."""
+    def _stages(self, k: jax.Array, dtype: DTypeLike) -> tuple[jax.Array, jax.Array]:
+        """The rate and the momentum of each stage of group k."""
         starts = jnp.asarray(self.plan.starts)[:, None]
         now = (k * self.interval + jnp.arange(self.interval, dtype=jnp.int32))[None, :]
         begun = starts <= now
@@ -132,25 +137,27 @@ class Surges:
 
 
 def _code(codes: jax.Array, i: jax.Array) -> jax.Array:
-    """What sweep i left on the tape, of which a word of 32 bits holds four."""
+    """The record of stage i in its low byte; a word of 32 bits holds the records of four stages."""
     word, shift = lax.optimization_barrier((lax.dynamic_index_in_dim(codes, i // 4, keepdims=False), 8 * (i % 4)))
     return lax.shift_right_logical(word, jnp.full(word.shape, shift, word.dtype))
 
 
 def _by_links(bed: Bed) -> bool:
+    """Whether the derivative follows from which links are active: with 4 or 8 neighbours and a closed edge."""
     return bed.neighbours != "isotropic" and bed.rim is None
 
 
 def _surface(around: Nothing | Partial, u: jax.Array) -> jax.Array:
+    """The height of the surface for a map of volumes per cell area, both with ghost cells."""
     return u if isinstance(around, Nothing) else halo(around.surface(at(u)))
 
 
 def _ease(around: Nothing | Partial, change: jax.Array) -> jax.Array:
-    """The surface's change for a change of what cells hold; symmetric."""
+    """The change of the surface for a change of the volume per cell area; a diagonal linear map, its own transpose."""
     return change if isinstance(around, Nothing) else around.surface(change)
 
 
-def _surge(params: Any, i: jax.Array, state: Any) -> Any:
+def _surge(params: tuple[Bed, Nothing | Partial, jax.Array, jax.Array, jax.Array], i: jax.Array, state: State) -> State:
     bed, around, rates, momenta, cut = params
     return surge(bed, Flow(rates[i], cut), momenta[i], around, state)
 

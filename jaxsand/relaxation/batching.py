@@ -1,7 +1,7 @@
-"""How a batch of maps shares the machine: in chunks that stay in a core's cache, on every core, and without waiting.
+"""Runs batches of maps on every core, in chunks that stay in a core's cache.
 
-A chunk of maps marches together until one in eight of them still moves; those are set aside, and chunks made of them march
-on. So a slow map costs its own sweeps, not those of its neighbours, and every map is swept as it would be alone.
+The maps of a chunk are swept together until only one in eight of them still moves. Those are set aside, and new chunks are
+made of them. So a slow map costs its own sweeps and not those of its neighbours. Every map is swept as it would be alone.
 """
 
 import math
@@ -9,33 +9,32 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.relaxation._integrate import March
+from jaxsand.autodiff.while_loop import Tree
+from jaxsand.relaxation._integrate import March, Sand
 from jaxsand.relaxation.ghost_cells import Lost
 
-_CELLS = 65_536  # to a chunk: what the sweep of a chunk keeps at hand fits into a core's cache
-_LEFT = 8  # a chunk stops when one in so many of its maps is left
-Tree = Any
+_CELLS = 65_536  # cells in a chunk, whose sweep then works in a core's cache
+_LEFT = 8  # a chunk stops when one in so many of its maps still moves
 
 
 def march_batch(
     march: March,
     groups: int,
-    enter: Callable[..., Any],
-    judge: Callable[..., Any],
+    enter: Callable[[jax.Array, Lost], Sand],
+    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
     height: jax.Array,
     lost: Lost,
     chunk: int,
 ) -> Tree:
     """`March.run` for every map of a batch [B, H, W], B a multiple of the chunk.
 
-    `enter(height, lost)` makes the sand of a map; `judge(height, sand, sweeps)` says what became of it, with its `height`.
+    `enter(height, lost)` makes the sand of a map; `judge(height, sand, sweeps)` makes its result, which has a `height`.
     """
     total = height.shape[0]
     run = partial(_together, march, groups, enter, judge)
@@ -48,8 +47,8 @@ def march_batch(
     return state[0]
 
 
-def _left_over(run: Callable[..., Any], chunk: int, state: Tree) -> Tree:
-    """Chunks of the maps that are left march on."""
+def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
+    """The state after chunks of the maps that still move were swept once more until few are left."""
     _, _, taken, ready = state
     order = jnp.argsort(jnp.where(ready, jnp.iinfo(jnp.int32).max, taken))
     left = jnp.sum(~ready)
@@ -66,15 +65,18 @@ def _left_over(run: Callable[..., Any], chunk: int, state: Tree) -> Tree:
 def _together(
     march: March,
     groups: int,
-    enter: Callable[..., Any],
-    judge: Callable[..., Any],
-    others: Any,
-    height: Any,
-    lost: Any,
-    taken: Any,
-    ready: Any,
+    enter: Callable[[jax.Array, Lost], Sand],
+    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
+    others: jax.Array | bool,
+    height: jax.Array,
+    lost: Lost,
+    taken: jax.Array,
+    ready: jax.Array,
 ) -> Tree:
-    """Marches maps [chunk, ...] until all are ready; where there are `others`, until all but a few are."""
+    """Sweeps the maps of a chunk until all are ready; where there are `others` to join, until all but a few are.
+
+    Returns for each map its result, what it lost, the number of groups of sweeps, and whether it is ready.
+    """
     few = ready.shape[0] // _LEFT
 
     def look(k: jax.Array, moving: Tree) -> jax.Array:
@@ -100,7 +102,7 @@ def _together(
 
 
 def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int | None) -> Tree:
-    """`run(others, batch, chunk=...)` on every core: the batch [B, ...] is cut into as many parts, of chunks of one size."""
+    """`run(others, batch, chunk=...)` on every core; each takes a part of the batch [B, ...], in chunks of one size."""
     leaves = jax.tree.leaves(batch)
     _refuse_tracers(jax.tree.leaves((batch, others)))
     total = leaves[0].shape[0]
@@ -131,12 +133,14 @@ def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int
 
 
 SIZES = (8, 16, 32, 64)
-"""Of groups, on a CPU: a few, so that few programs are compiled."""
+"""Sizes of groups on a CPU; there are few, so that few programs are compiled."""
 
 
 def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], np.ndarray], chunk: int | None) -> Tree:
-    """`run` on groups of a batch [B, ...] of like cost, the dearest first; each core takes the next. The last group is
-    filled up by copies."""
+    """`run` on groups of a batch [B, ...] of like cost, the most expensive first; each free core takes the next group.
+
+    The last group is filled up with copies.
+    """
     leaves = jax.tree.leaves(batch)
     _refuse_tracers(leaves)
     total = leaves[0].shape[0]
@@ -157,7 +161,7 @@ def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], n
 
 
 def group_size(total: int, chunk: int | None) -> int:
-    """How many maps of a batch to push together."""
+    """The number of maps of a batch that are pushed together."""
     if chunk is not None:
         return min(chunk, next((size for size in SIZES if size >= total), chunk))
     if not _on_cpu():
@@ -165,7 +169,7 @@ def group_size(total: int, chunk: int | None) -> int:
     return next((size for size in SIZES if size * cores() >= total), SIZES[-1])
 
 
-def _refuse_tracers(leaves: list[Any]) -> None:
+def _refuse_tracers(leaves: list[object]) -> None:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         raise ValueError(
             "settle_batch, step_batch and their like are outermost programs: inside jit, grad or vmap use jax.vmap of "
@@ -173,8 +177,11 @@ def _refuse_tracers(leaves: list[Any]) -> None:
         )
 
 
-def in_turns(runs: Sequence[Callable[[Any], Tree]], flagged: Callable[[Tree], jax.Array]) -> Tree:
-    """The batch of the first run, `runs[0](which)`; what is flagged in it comes from the second, and so on."""
+def in_turns(runs: Sequence[Callable[[slice | np.ndarray], Tree]], flagged: Callable[[Tree], jax.Array]) -> Tree:
+    """The results of the first of `runs` for a batch; those that `flagged` marks are replaced by the second's, and so on.
+
+    A run is a function of the indices of maps that returns their results.
+    """
     out = runs[0](slice(None))
     for run in runs[1:]:
         left = np.flatnonzero(flagged(out))
@@ -185,16 +192,16 @@ def in_turns(runs: Sequence[Callable[[Any], Tree]], flagged: Callable[[Tree], ja
 
 
 def cores() -> int:
-    """How many cores there are to compute on; 1 where something else than a CPU does."""
+    """The number of cores to compute on; 1 on an accelerator."""
     return processors() if _on_cpu() else 1
 
 
 def processors() -> int:
-    """How many of the CPU's cores this process may use."""
+    """The number of the CPU's cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def wide_vectors() -> dict[str, Any]:
+def wide_vectors() -> dict[str, int]:
     """Compiler options for the outermost programs: 512-bit vectors where the CPU has them."""
     return {"xla_cpu_prefer_vector_width": 512} if _on_cpu() else {}
 

@@ -1,20 +1,22 @@
-"""Where sand flows: over every link that is steeper than repose.
+"""The flux of sand over every link that is steeper than repose.
 
-With heights h, spacing dx and mu = tan(angle of repose), a sweep is a gradient step on a convex function of h. For 4 or 8
-neighbours that is half the sum over links of length d = l dx of the squared excess, and what cell i gains from cell j is
+With heights h, spacing dx and mu = tan(angle of repose), a sweep is a gradient step on a convex function E of h. For 4 or 8
+neighbours, E is the sum over links, of length l dx, of excess^2 / (2 l), and cell i gains from cell j the flux
 
-    f_ij = excess(h_j - h_i, mu d) / l,       excess(s, m) = s - clip(s, -m, m)
+    f_ij = excess(h_j - h_i, mu l dx) / l,       excess(s, m) = s - clip(s, -m, m)
 
-(Eq. 1-2 of arXiv:1908.02745). Repose then holds along eight directions and piles are octagons. Isotropic sand yields to the
-length of the gradient: with the four one-sided gradients g of a cell, one for each pair of a straight neighbour along x and
-one along y, the function is 1/4 sum max(|g| - mu, 0)^2 / 2 over all of them, and only straight links carry sand,
+(Eq. 1-2 of arXiv:1908.02745). Repose then holds along four or eight directions; with eight, piles are octagons.
+
+Isotropic sand limits the length of the gradient. A cell has four one-sided gradients g, one for each pair of a straight
+neighbour along x and one along y. E is the sum of max(|g| - mu, 0)^2 / 8 over all of them, with heights in spacings, and
+only straight links carry sand:
 
     f_ij = (h_j - h_i) * mean of max(1 - mu / |g|, 0) over the four gradients that contain the link.
 
-It converges to the conical pile as the grid is refined. A missing neighbour (wall, edge) has no slope.
+Its piles converge to cones as the grid is refined. A link to a missing neighbour (wall, edge) carries nothing.
 
-Links are kept as maps, one for each direction, with one row or column more than the map has: cell j loses the very number
-that cell i gains.
+Fluxes are kept as one map for each direction of links, with one row or column more than the map has, so that cell j loses
+the very number that cell i gains.
 """
 
 import math
@@ -25,64 +27,75 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxsand.relaxation.ghost_cells import Bed, Rim, at, halo
 from jaxsand.scene.grid import Link, Neighbours, links
 
 Fluxes = tuple[jax.Array, ...]
-NARROW = 0.05  # in an open share below this sand stands no higher than it would in this one
+NARROW = 0.05  # the smallest open share that is divided by: in a narrower one sand stands as high as in this
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Nothing:
-    """No tool stands in the sand and every cell is whole (neutral)."""
+    """No tool stands in the sand, and every cell is whole."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Around:
-    """A tool standing in the sand; see `stand`.
+    """A tool that stands in the sand; see `stand`.
 
-    A cell of mean height h above the tool's bottom b holds that sand in its open share, where it stands at
-    h + stretch (h - b), stretch = cover / open (in a sliver less, so that the flow out of it ends as it closes). A link is
-    as open as the less open of its two cells, which keeps a sweep stable for any cover.
+    Where a cell of mean height h above the tool's bottom b is partly covered, its sand stands in the open share, at the
+    height h + stretch (h - b) with stretch = cover / open. A link is as open as the less open of its two cells, which keeps
+    a sweep stable for any footprint.
+
+    Attributes:
+        open: the open share of each cell, with ghost cells.
+        stretch: how much higher sand stands for the tool; less than cover / open where the open share is below `NARROW`.
+        bottom: height of the tool's bottom (m).
     """
 
-    open: jax.Array  # [H + 2, W + 2]
-    stretch: jax.Array  # [H, W]
-    bottom: jax.Array  # m, []
+    open: Float[Array, "H+2 W+2"]
+    stretch: Float[Array, "H W"]
+    bottom: Float[Array, ""]
 
-    def surface(self, height: jax.Array) -> jax.Array:
+    def surface(self, height: Float[Array, "H W"]) -> Float[Array, "H W"]:
+        """The height at which the sand of each cell stands in its open share (m)."""
         return height + self.stretch * jnp.where(height > self.bottom, height - self.bottom, 0)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Partial:
-    """Cells of which only a share, `open` [H + 2, W + 2], can hold sand: a map [H, W] of volume per cell area."""
+    """Cells of which only the share `open` can hold sand; maps then hold volume per cell area."""
 
-    open: jax.Array
+    open: Float[Array, "H+2 W+2"]
 
-    def surface(self, volume: jax.Array) -> jax.Array:
+    def surface(self, volume: Float[Array, "H W"]) -> Float[Array, "H W"]:
+        """The height at which the sand of each cell stands in its open share (m)."""
         share = at(self.open)
         return volume / jnp.where(share > 0, share, 1)
 
 
-def stand(cover: jax.Array, bottom: jax.Array) -> Around:
-    """A tool with its bottom at height `bottom` (m) that covers the share `cover` [H, W] of each cell."""
+def stand(cover: Float[Array, "H W"], bottom: Float[Array, ""]) -> Around:
+    """A tool with its bottom at height `bottom` (m) whose footprint is `cover`, the share of each cell that it covers."""
     free = 1 - cover
     return Around(halo(free, 0.0), cover / jnp.maximum(free, NARROW), bottom)
 
 
-def fluxes(bed: Bed, around: Nothing | Partial, u: jax.Array) -> Fluxes:
-    """What flows over every link of a map with halo at rate 1 (m), towards its first cell; last what drains, if it does."""
+def fluxes(bed: Bed, around: Nothing | Partial, u: Float[Array, "H+2 W+2"]) -> Fluxes:
+    """The flux over every link of a map with ghost cells at rate 1 (m), positive towards the link's first cell.
+
+    Where the edge drains, a last map [H, W] holds what each cell loses over the rim.
+    """
     s, gate = (u, None) if isinstance(around, Nothing) else (halo(around.surface(at(u))), around.open)
     return flows(bed, gate, s)
 
 
-def flows(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
-    """`fluxes` for a surface with halo, behind a gate."""
+def flows(bed: Bed, gate: Float[Array, "H+2 W+2"] | None, s: Float[Array, "H+2 W+2"]) -> Fluxes:
+    """`fluxes` of a surface with ghost cells, where `gate` is the open share of each cell, None where all are whole."""
     flow = _isotropic(bed, gate, s) if bed.neighbours == "isotropic" else _pairwise(bed, gate, s)
     if bed.rim is not None:
         out = _over(bed, bed.rim, at(s)) * _draining_sides(bed.rim)
@@ -90,14 +103,14 @@ def flows(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
     return flow
 
 
-def gained(bed: Bed, flow: Fluxes) -> jax.Array:
-    """What each cell [H, W] gains from the fluxes over its links."""
+def gained(bed: Bed, flow: Fluxes) -> Float[Array, "H W"]:
+    """What each cell gains from the fluxes over its links, less what it loses over the rim."""
     net = received(bed.neighbours, flow)
     return net if bed.rim is None else net - flow[-1]
 
 
-def received(neighbours: Neighbours, flow: Fluxes) -> jax.Array:
-    """What each cell [H, W, ...] receives over links, less what it gives."""
+def received(neighbours: Neighbours, flow: Fluxes) -> Float[Array, "H W ..."]:
+    """What each cell receives over its links, less what it gives."""
     net = jnp.zeros((), flow[0].dtype)
     for (di, dj, _), f in zip(links(neighbours), flow, strict=False):
         rows, columns = f.shape[:2]
@@ -106,16 +119,16 @@ def received(neighbours: Neighbours, flow: Fluxes) -> jax.Array:
     return net
 
 
-def fluxes_zero(bed: Bed, u: jax.Array) -> Fluxes:
-    """No flux over any link of a map with halo."""
+def fluxes_zero(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Fluxes:
+    """Fluxes of 0 for a map with ghost cells."""
     maps = [jnp.zeros_like(ends(u, di, dj)[0]) for di, dj, _ in links(bed.neighbours)]
     return (*maps, jnp.zeros_like(at(u))) if bed.rim is not None else tuple(maps)
 
 
-def worst_excess(bed: Bed, u: jax.Array, around: Nothing | Partial | None = None) -> jax.Array:
-    """The largest slope in excess of repose (a tangent) of a map with halo; 0 when it is still.
+def worst_excess(bed: Bed, u: Float[Array, "H+2 W+2"], around: Nothing | Partial | None = None) -> Float[Array, ""]:
+    """The largest slope in excess of repose (a tangent) of a map with ghost cells; 0 when the map is still.
 
-    In partial cells an excess counts as far as it drives sand: where flows end, it is 0.
+    In partial cells an excess counts only as far as it drives sand, so that it is 0 where nothing flows.
     """
     gate = None
     if isinstance(around, Partial):
@@ -126,8 +139,8 @@ def worst_excess(bed: Bed, u: jax.Array, around: Nothing | Partial | None = None
     return worst / bed.spacing
 
 
-def middle(bed: Bed, u: jax.Array, tolerance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Row and column of the middle of the box around all that is steeper than repose by more than the tolerance."""
+def middle(bed: Bed, u: Float[Array, "H+2 W+2"], tolerance: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Row and column of the middle of the box around all slopes that exceed repose by more than the tolerance."""
     moving: Any = False
     for e in _excesses(bed, None, u):
         moving = moving | (e > tolerance * bed.spacing)
@@ -140,21 +153,21 @@ def middle(bed: Bed, u: jax.Array, tolerance: jax.Array) -> tuple[jax.Array, jax
     return bounds[0], bounds[1]
 
 
-def steepest(bed: Bed, u: jax.Array) -> jax.Array:
-    """The steepest slope (a tangent) of a map with halo, as its neighbourhood measures slopes."""
+def steepest(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Float[Array, ""]:
+    """The steepest slope (a tangent) of a map with ghost cells, as the bed's neighbourhood measures slopes."""
     return _highest(slope for slope, _ in _slopes(bed, u)) / bed.spacing
 
 
 def _highest(maps: Iterable[jax.Array]) -> jax.Array:
-    """The highest value in any of the maps, at least 0; NaN means no link."""
+    """The largest value in any of the maps, at least 0; NaN marks a missing link and is ignored."""
     worst: Any = 0.0
     for e in maps:
         worst = jnp.where(e > worst, e, worst)
     return jnp.max(jnp.max(worst, axis=0))  # rows first: XLA vectorises that
 
 
-def ends(u: jax.Array, di: int, dj: int) -> tuple[jax.Array, jax.Array]:
-    """The first and the second cell of every link in the direction (di, dj) of a map with halo."""
+def ends(u: Float[Array, "H+2 W+2 ..."], di: int, dj: int) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """The values in the first and the second cell of every link in the direction (di, dj) of a map with ghost cells."""
     if di == 0:
         return u[1:-1, :-1], u[1:-1, 1:]
     if dj == 0:
@@ -167,7 +180,7 @@ def _pairwise(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
 
 
 def link_flux(bed: Bed, gate: jax.Array | None, s: jax.Array, link: Link) -> jax.Array:
-    """excess / l over every link in one direction."""
+    """The flux excess / l over every link in one direction."""
     di, dj, length = link
     here, there = ends(s, di, dj)
     d, m = there - here, _yield(bed, link)
@@ -178,7 +191,7 @@ def link_flux(bed: Bed, gate: jax.Array | None, s: jax.Array, link: Link) -> jax
 
 
 def _slopes(bed: Bed, u: jax.Array) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Slopes [H, W] and the largest stable ones, times the spacing: of links in one direction, or of gradients."""
+    """Slopes [H, W] and the largest stable ones, both times the spacing (m); for each direction of links, or gradient."""
     if bed.neighbours != "isotropic":
         for link in links(bed.neighbours):
             di, dj, length = link
@@ -193,7 +206,7 @@ def _slopes(bed: Bed, u: jax.Array) -> Iterator[tuple[jax.Array, jax.Array]]:
 
 
 def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Array]:
-    """Slopes less the largest stable ones, times the spacing; behind a gate no more than the flow that they drive."""
+    """Slopes less the largest stable ones, times the spacing (m); in partial cells no more than the flux that they drive."""
     if gate is None:
         yield from (slope - level for slope, level in _slopes(bed, u))
     elif bed.neighbours != "isotropic":
@@ -209,12 +222,13 @@ def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Ar
 
 
 def _arms(gate: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-    """How open the two arms of each of the four gradients are; see `_triangles`."""
+    """The open shares of the two links of each of the four gradients; see `_triangles`."""
     x, y = (jnp.minimum(*ends(gate, di, dj)) for di, dj, _ in links(4))
     return [(_ends_x(x)[i], _ends_y(y)[j]) for i in (0, 1) for j in (0, 1)]
 
 
 def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
+    """The fluxes of isotropic sand over the straight links."""
     x, y = _steps(s)
     weights = []
     if gate is None:
@@ -222,7 +236,7 @@ def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
             w = _yielding(gx * gx + gy * gy, m)
             weights.append((w, w))
         opening = None
-    else:  # a gradient feels its other arm as far as that arm is open
+    else:  # in the gradient of one link the other link counts as far as it is open
         opening = tuple(jnp.minimum(*ends(gate, di, dj)) for di, dj, _ in links(4))
         for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
             weights.append((_yielding(gx * gx + oy * gy * gy, m), _yielding(ox * gx * gx + gy * gy, m)))
@@ -235,13 +249,13 @@ def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
 
 
 def _yielding(square: jax.Array, m: jax.Array) -> jax.Array:
-    """max(1 - m / |g|, 0)."""
+    """max(1 - m / |g|, 0) for |g|^2 = square."""
     steep = square > m * m
     return jnp.where(steep, 1 - m / jnp.sqrt(jnp.where(steep, square, 1)), 0)
 
 
 def _steps(u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Differences over the straight links, 0 where one end holds no sand: [H, W + 1] and [H + 1, W]."""
+    """The steps over the links along x [H, W + 1] and y [H + 1, W]; 0 where one end holds no sand."""
     steps = []
     for di, dj, _ in links(4):
         here, there = ends(u, di, dj)
@@ -259,7 +273,10 @@ def _ends_y(y: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _triangles(bed: Bed, x: jax.Array, y: jax.Array) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
-    """The four one-sided gradients of every cell, west-south, west-north, east-south, east-north, and where each yields."""
+    """The four one-sided gradients (x, y) of every cell, and the largest stable length of each.
+
+    Their order is west-south, west-north, east-south, east-north.
+    """
     mu = bed.drop / bed.spacing
     if mu.ndim:
         hx, hy = (jnp.add(*ends(halo(mu), di, dj)) / 2 for di, dj, _ in links(4))
@@ -283,12 +300,12 @@ def _yield(bed: Bed, link: Link) -> jax.Array:
 
 
 def _draining_sides(rim: Rim) -> jax.Array:
-    """How many sides of each cell drain, 0 to 4."""
+    """The number of sides over which each cell drains, 0 to 4."""
     beyond = rim.beyond
     return at(beyond, 1, 0) + at(beyond, -1, 0) + at(beyond, 0, 1) + at(beyond, 0, -1)
 
 
 def _over(bed: Bed, rim: Rim, h: jax.Array) -> jax.Array:
-    """Height in excess of repose against the rim, half a spacing away."""
+    """The height in excess of repose against the rim, which is half a spacing away (m)."""
     top = rim.level + bed.drop / 2
     return jnp.where(h > top, h - top, 0)

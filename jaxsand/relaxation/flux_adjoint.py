@@ -1,56 +1,59 @@
-"""The derivative of a sweep where sand flows in pairs: links that are steeper than repose pass tangents on, others nothing.
+"""The jvp and vjp of a sweep with 4 or 8 neighbours: links steeper than repose pass tangents on, other links do not.
 
-With 4 or 8 neighbours a sweep is piecewise linear. With s the surface, D its steps over the links, G = -D^T what cells gain
-from fluxes, A the links that are active, sigma = +-1 the side to which they are steeper than m, and c the rate over a link's
-length (times how open it is), it reads u + G c A (D s - sigma m), so that
+Such a sweep is piecewise linear. Let s be the surface, D s its steps over the links, G = -D^T what cells gain from fluxes, A
+the active links, which are steeper than the largest stable step m, sigma = +-1 the side to which they are, and c the rate
+over a link's length times its open share. The sweep is u' = u + G c A (D s - sigma m), so that with ds = S du
 
-    du'     = du + G c A (D ds - sigma dm)              forwards
-    lambda  = lambda' + S^T G c A D lambda'             backwards, ds = S du,
-    mu      = sum of c A sigma D lambda'                for m.
+    du'     = du + G c A (D ds - sigma dm)              is its jvp,
+    lambda  = lambda' + S^T G c A D lambda'             its vjp for u, and
+    mu      = sum of c A sigma D lambda'                its vjp for m.
 
-Links of all directions are kept on one lattice [H + 1, W + 1], on whose point (i, j) the cells (i, j) to (i + 1, j + 1) of a
-map with halo meet; two bits for each link say whether it is active, and to which side.
+Links of all directions are kept on one lattice [H + 1, W + 1]. At its point (i, j) the cells (i, j) to (i + 1, j + 1) of a
+map with ghost cells meet. Two bits for each link say whether it is active, and to which side.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsand.relaxation.ghost_cells import Bed, halo
 from jaxsand.scene.grid import links
 
-Lattice = tuple[jax.Array, ...]  # a map [H + 1, W + 1] for each direction of links
+Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
+OnLattice = Float[Array, "H+1 W+1"]
+Codes = Int[Array, "H+1 W+1"]
+Lattice = tuple[OnLattice, ...]  # for each direction of links
 _CORNERS = {(0, 1): (0, 1), (1, 0): (0, 2), (1, 1): (0, 3), (1, -1): (1, 2)}
 
 
 def _around(u: jax.Array) -> tuple[jax.Array, ...]:
-    """The four cells of a map with halo that meet at each point."""
+    """The four cells of a map with ghost cells that meet at each point of the lattice."""
     return u[:-1, :-1], u[:-1, 1:], u[1:, :-1], u[1:, 1:]
 
 
-def pairs(bed: Bed, u: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-    """The first and the second cell of every link, for each direction."""
+def pairs(bed: Bed, u: Ghosted) -> list[tuple[OnLattice, OnLattice]]:
+    """The values in the first and the second cell of every link, for each direction."""
     cells = _around(u)
     return [(cells[_CORNERS[di, dj][0]], cells[_CORNERS[di, dj][1]]) for di, dj, _ in links(bed.neighbours)]
 
 
-def steps(bed: Bed, u: jax.Array) -> Lattice:
+def steps(bed: Bed, u: Ghosted) -> Lattice:
     """The step over every link, from its first to its second cell."""
     return tuple(there - here for here, there in pairs(bed, u))
 
 
 def stored(flow: list[jax.Array]) -> list[jax.Array]:
-    """The maps, computed once: by concatenation, lest XLA compute them anew in all that uses them."""
+    """The same maps, computed once and stored; XLA would else compute them anew wherever they are used."""
     both = lax.optimization_barrier(lax.concatenate(flow, 0))
     rows = flow[0].shape[0]
     return [both[k * rows : (k + 1) * rows] for k in range(len(flow))]
 
 
-def gains(bed: Bed, flow: Lattice) -> jax.Array:
-    """What each cell [H, W] gains from flows towards the links' first cells."""
+def gains(bed: Bed, flow: Lattice) -> Float[Array, "H W"]:
+    """What each cell [H, W] gains from fluxes, which are positive towards the links' first cells."""
     net: jax.Array | float = 0.0
     for (di, dj, _), f in zip(links(bed.neighbours), flow, strict=True):
         beside = _around(f)  # a cell is corner 3 of the point before it, and corner 0 of its own
@@ -60,62 +63,66 @@ def gains(bed: Bed, flow: Lattice) -> jax.Array:
 
 
 def yields(bed: Bed) -> Lattice | tuple[jax.Array, ...]:
-    """The largest stable step over every link; one number for each direction where the angle is everywhere the same."""
+    """The largest stable step over every link; one number for each direction where the angle of repose is a scalar."""
     if not bed.drop.ndim:
         return tuple(bed.drop * length for _, _, length in links(bed.neighbours))
     both = pairs(bed, halo(bed.drop, 0.0))
     return tuple((a + b) * (length / 2) for (a, b), (_, _, length) in zip(both, links(bed.neighbours), strict=True))
 
 
-def active(bed: Bed, s: jax.Array) -> jax.Array:
-    """Two bits for each link: steeper than repose upwards, or downwards; the low byte of integers [H + 1, W + 1]."""
+def active(bed: Bed, s: Ghosted) -> Codes:
+    """Two bits for each link, in the low byte of integers [H + 1, W + 1]: too steep upwards, too steep downwards."""
     code = jnp.zeros((), jnp.int32)
     for k, (d, m) in enumerate(zip(steps(bed, s), yields(bed), strict=True)):
         code = code | jnp.where(d > m, 1 << 2 * k, jnp.where(d < -m, 2 << 2 * k, 0))
     return code
 
 
-def opened(bed: Bed, gate: jax.Array | None) -> list[Any]:
-    """What of a surface's excess flows over each link at rate 1."""
-    lengths = [1 / length for _, _, length in links(bed.neighbours)]
+def opened(bed: Bed, gate: Ghosted | None) -> list[jax.Array | float]:
+    """The part of a surface's excess that flows over each link at rate 1; `gate` is the open share of each cell."""
+    lengths: list[jax.Array | float] = [1 / length for _, _, length in links(bed.neighbours)]
     if gate is None:
         return lengths
     return [jnp.minimum(here, there) * w for (here, there), w in zip(pairs(bed, gate), lengths, strict=True)]
 
 
-def upward(code: jax.Array, link: int) -> jax.Array:
+def upward(code: Codes, link: int) -> Bool[Array, "H+1 W+1"]:
+    """Whether a link is too steep upwards; see `active`."""
     return (code & (1 << 2 * link)) != 0
 
 
-def downward(code: jax.Array, link: int) -> jax.Array:
+def downward(code: Codes, link: int) -> Bool[Array, "H+1 W+1"]:
+    """Whether a link is too steep downwards; see `active`."""
     return (code & (2 << 2 * link)) != 0
 
 
-def moving(code: jax.Array, link: int) -> jax.Array:
+def moving(code: Codes, link: int) -> Bool[Array, "H+1 W+1"]:
+    """Whether a link is too steep to either side; see `active`."""
     return (code & (3 << 2 * link)) != 0
 
 
 def to_lattice(bed: Bed, flow: tuple[jax.Array, ...]) -> Lattice:
-    """Maps over links as flux.py keeps them, on the lattice."""
+    """Fluxes in the shapes of flux.py, moved to the lattice."""
     along_x, along_y, *diagonal = flow
     return (jnp.pad(along_x, ((1, 0), (0, 0))), jnp.pad(along_y, ((0, 0), (1, 0))), *diagonal)
 
 
 def from_lattice(bed: Bed, flow: Lattice) -> tuple[jax.Array, ...]:
+    """Fluxes on the lattice, in the shapes of flux.py."""
     along_x, along_y, *diagonal = flow
     return (along_x[1:], along_y[:, 1:], *diagonal)
 
 
 def drop_cotangent(bed: Bed, parts: list[jax.Array]) -> jax.Array:
-    """The cotangent of `bed.drop` from those of the largest stable steps over every link, maps."""
+    """The cotangent of `bed.drop` from those of the largest stable step over every link."""
     if not bed.drop.ndim:
         both = [p * length for p, (_, _, length) in zip(parts, links(bed.neighbours), strict=True)]
         return jnp.sum(jnp.asarray(sum(both)))
     return jax.vjp(lambda drop: yields(replace(bed, drop=drop)), bed.drop)[1](tuple(parts))[0]
 
 
-def to_less_open(bed: Bed, gate: jax.Array, parts: list[jax.Array]) -> jax.Array:
-    """The cotangent of a map with halo whose least value of both cells gates each link."""
+def to_less_open(bed: Bed, gate: Ghosted, parts: list[OnLattice]) -> Ghosted:
+    """The cotangent of the open shares [H + 2, W + 2], of which the lesser at each link is the share of the link."""
     net: jax.Array | float = 0.0
     for (di, dj, _), (here, there), part in zip(links(bed.neighbours), pairs(bed, gate), parts, strict=True):
         first, second = _CORNERS[di, dj]
@@ -124,11 +131,11 @@ def to_less_open(bed: Bed, gate: jax.Array, parts: list[jax.Array]) -> jax.Array
     return halo(jnp.asarray(net), 0.0)
 
 
-def total(x: jax.Array) -> jax.Array:
-    """The sum of a map, rows first: XLA vectorises that."""
+def total(x: Float[Array, "H W"]) -> Float[Array, ""]:
+    """The sum of a map; the rows come first because XLA vectorises that."""
     return jnp.sum(jnp.sum(x, axis=0))
 
 
 def to_shape(cotangent: jax.Array, like: jax.Array) -> jax.Array:
-    """The cotangent of what was broadcast to a map."""
+    """The cotangent of a map or number that was broadcast to a map."""
     return cotangent if like.ndim else total(cotangent)

@@ -1,9 +1,10 @@
-"""The bed: a height map made ready for sweeping, and the arithmetic that keeps its volume.
+"""Height maps with ghost cells, and the arithmetic that conserves their volume.
 
-A cell without sand (solid, beyond the edge, not finite) holds NaN while sweeping: every comparison with it is false, so
-nothing flows. Maps are kept in a halo of one such cell on each side. Every flux is cut to a whole number of quanta. A
-quantum is a power of two so chosen that sums of quanta are exact in the floats at hand: volume is conserved to the last bit
-where the heights are whole quanta themselves, and no rounding builds up where they are not. The derivative ignores the cut.
+While sweeping, a cell without sand (solid, beyond the edge, not finite) holds NaN. Every comparison with NaN is false, so
+that nothing flows there. Each map has one ghost cell of this kind on each side. Every flux is cut to a multiple of a
+quantum, a power of two such that sums of quanta are exact in the height's dtype. So volume is conserved to the last bit
+where heights are multiples of the quantum, and rounding errors do not build up where they are not. Derivatives ignore the
+cut.
 """
 
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from jaxsand.scene.boundaries import Draining, Walls
 from jaxsand.scene.grid import Neighbours
@@ -22,26 +24,34 @@ Lost = tuple[jax.Array, jax.Array] | None
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Bed:
-    """What a sweep needs of a scene; its maps can be cut to a window."""
+    """What a sweep needs of a scene; its maps can be cut to a window.
 
-    spacing: jax.Array  # m, []
-    drop: jax.Array  # the largest stable step between straight neighbours, mu dx: [] or [H, W]
+    Attributes:
+        spacing: distance of neighbouring cell centres dx (m).
+        drop: largest stable step between straight neighbours, tan(angle of repose) dx (m).
+        rim: the draining edge, or None where the edge is closed.
+        elsewhere: largest |height| outside the block of the map that is swept, or the depth of the rim below 0 (m).
+        neighbours: 4, 8 or "isotropic".
+    """
+
+    spacing: Float[Array, ""]
+    drop: Float[Array, ""] | Float[Array, "H W"]
     rim: "Rim | None"
-    elsewhere: jax.Array  # the largest |height| outside a block of a map, or the depth below 0 of a rim (m), []
+    elsewhere: Float[Array, ""]
     neighbours: Neighbours = field(metadata={"static": True})
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Rim:
-    """A draining edge: `beyond` [H + 2, W + 2] is 1 in the map's halo and 0 inside; the rim stands at `level` (m)."""
+    """A draining edge: `beyond` is 1 in the ghost cells and 0 elsewhere; the rim stands at the height `level` (m)."""
 
-    beyond: jax.Array
-    level: jax.Array
+    beyond: Float[Array, "H+2 W+2"]
+    level: Float[Array, ""]
 
 
 def prepare(scene: Scene) -> Bed:
-    """The scene's bed; the scene's floats have the height's dtype already."""
+    """The bed of a scene whose numbers were cast to the height's dtype; see `fit`."""
     dx = jnp.asarray(scene.grid.spacing)
     drop = jnp.tan(jnp.asarray(scene.material.repose_angle)) * dx
     rim = rim_of(scene.grid.shape, jnp.asarray(scene.edge.level)) if isinstance(scene.edge, Draining) else None
@@ -52,13 +62,13 @@ def prepare(scene: Scene) -> Bed:
     return Bed(dx, drop, rim, deep, scene.grid.neighbours)
 
 
-def rim_of(shape: tuple[int, ...], level: jax.Array) -> Rim:
-    """The rim of a map of this shape."""
+def rim_of(shape: tuple[int, ...], level: Float[Array, ""]) -> Rim:
+    """The rim of a map of this shape, all of whose edges drain."""
     return Rim(halo(jnp.zeros(shape, level.dtype), 1.0), level)
 
 
-def mark(scene: Scene, height: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The height with NaN in the cells that hold no sand, and whether a cell that should hold some is not finite."""
+def mark(scene: Scene, height: Float[Array, "H W"]) -> tuple[Float[Array, "H W"], Bool[Array, ""]]:
+    """The height with NaN in the cells that hold no sand, and whether a cell that is not solid is not finite."""
     finite = jnp.isfinite(height)
     if isinstance(scene.walls, Walls):
         sand = finite & ~scene.walls.solid
@@ -66,46 +76,46 @@ def mark(scene: Scene, height: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(finite, height, jnp.nan), ~jnp.all(finite)
 
 
-def unmark(height: jax.Array, original: jax.Array) -> jax.Array:
-    """The height with the original values in the cells that hold no sand."""
+def unmark(height: Float[Array, "H W"], original: Float[Array, "H W"]) -> Float[Array, "H W"]:
+    """The height with the original values in place of NaN, in the cells that hold no sand."""
     return jnp.where(jnp.isnan(height), original, height)
 
 
-def spoiled(before: jax.Array, after: jax.Array) -> jax.Array:
-    """Whether a marked map lost a cell on the way, or overflowed."""
+def spoiled(before: Float[Array, "H W"], after: Float[Array, "H W"]) -> Bool[Array, ""]:
+    """Whether a computation made NaN of a cell with sand, or an infinity; both maps are marked."""
     return jnp.any((jnp.isnan(after) != jnp.isnan(before)) | jnp.isinf(after))
 
 
-def sound(bed: Bed) -> jax.Array:
-    """Whether spacing and angles are usable numbers; what is traced escapes `make_scene`."""
+def sound(bed: Bed) -> Bool[Array, ""]:
+    """Whether spacing and angles are in range; checks traced values, which `make_scene` cannot."""
     return jnp.all(jnp.isfinite(bed.drop) & (bed.drop >= 0)) & (bed.spacing > 0)
 
 
-def largest(height: jax.Array) -> jax.Array:
-    """The largest |height| where there is sand."""
+def largest(height: Float[Array, "..."]) -> Float[Array, ""]:
+    """The largest |height| of cells with sand (m)."""
     size = jnp.abs(height)
     return jnp.max(jnp.max(jnp.where(size > 0, size, 0), axis=0))  # rows first: XLA vectorises that
 
 
-def quantum(scale: jax.Array) -> jax.Array:
-    """The power of two of which heights up to `scale` hold at most 2^(p - 1), p the significand's bits."""
+def quantum(scale: Float[Array, ""]) -> Float[Array, ""]:
+    """The least power of two of which heights up to `scale` hold at most 2^(p - 1), p the number of significand bits."""
     info = jnp.finfo(scale.dtype)
     scale = jnp.maximum(lax.stop_gradient(scale), float(info.tiny) * 2.0**info.nmant)
     _, exponent = jnp.frexp(scale)
     return jnp.ldexp(jnp.ones_like(scale), exponent - info.nmant)
 
 
-def grain(bed: Bed, u: jax.Array) -> jax.Array:
-    """The quantum for a map with halo."""
+def grain(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Float[Array, ""]:
+    """The quantum for a map with ghost cells (m)."""
     return quantum(jnp.maximum(largest(u), bed.elsewhere))
 
 
 @jax.custom_jvp
 def truncate(x: jax.Array) -> jax.Array:
-    """Towards zero to a whole number; its derivative is taken to be that of the identity.
+    """The whole number next to x towards zero; its derivative is that of the identity.
 
-    Reverse mode forgets such a rule after the first derivative: loops that use it must refuse a second one
-    (while_loop.py does).
+    JAX forgets this rule when a derivative in reverse mode is differentiated again, so that loops that use it must refuse
+    second derivatives, as while_loop.py does.
     """
     return jnp.trunc(x)
 
@@ -115,7 +125,7 @@ truncate.defjvps(lambda tangent, _, x: tangent)
 
 @jax.custom_jvp
 def nearest(x: jax.Array) -> jax.Array:
-    """The nearest whole number, one instruction where `truncate` takes several; its derivative is the identity's too."""
+    """The nearest whole number; its derivative is that of the identity. Faster than `truncate`."""
     return lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN)
 
 
@@ -123,7 +133,10 @@ nearest.defjvps(lambda tangent, _, x: tangent)
 
 
 def lose(quantum: jax.Array, lost: tuple[jax.Array, jax.Array], amount: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Adds whole quanta [H, W] to what was lost: (low, high), whose sum is exact far beyond the reach of one float."""
+    """Adds an amount [H, W], in whole quanta, to the account `lost` of what drained.
+
+    The account is a pair (low, high) of maps whose sum is exact far beyond the range of one float.
+    """
     low, high = lost
     low = low + amount
     coarse = quantum * 4096
@@ -132,21 +145,22 @@ def lose(quantum: jax.Array, lost: tuple[jax.Array, jax.Array], amount: jax.Arra
 
 
 def nothing_lost(bed: Bed, height: jax.Array) -> Lost:
-    """The start of the account of `lose`, if the bed drains."""
+    """The account of `lose` before anything drained; None if the edge is closed."""
     return None if bed.rim is None else (jnp.zeros_like(height), jnp.zeros_like(height))
 
 
-def volume_lost(bed: Bed, lost: Lost) -> jax.Array:
+def volume_lost(bed: Bed, lost: Lost) -> Float[Array, ""]:
     """The volume that drained (m^3)."""
     if lost is None:
         return jnp.zeros_like(bed.spacing)
     return (jnp.sum(lost[1]) + jnp.sum(lost[0])) * bed.spacing**2
 
 
-def halo(x: jax.Array, value: float = jnp.nan) -> jax.Array:
-    """The map with one more cell on each side, stored.
+def halo(x: Float[Array, "H W ..."], value: float = jnp.nan) -> Float[Array, "H+2 W+2 ..."]:
+    """The map with one ghost cell of the given value on each side.
 
-    By concatenation, which XLA vectorises on CPUs, and behind a barrier, lest it be computed anew for every neighbour.
+    It is built by concatenation, which XLA vectorises on CPUs, and behind a barrier, so that it is stored and not computed
+    anew for every neighbour.
     """
     row = jnp.full((1, *x.shape[1:]), value, x.dtype)
     x = lax.concatenate([row, x, row], 0)
@@ -154,7 +168,7 @@ def halo(x: jax.Array, value: float = jnp.nan) -> jax.Array:
     return lax.optimization_barrier(lax.concatenate([column, x, column], 1))
 
 
-def at(u: jax.Array, di: int = 0, dj: int = 0) -> jax.Array:
-    """What each inner cell of a map with halo sees (di, dj) cells further."""
+def at(u: Float[Array, "H+2 W+2 ..."], di: int = 0, dj: int = 0) -> Float[Array, "H W ..."]:
+    """The value di rows and dj columns further, for each inner cell of a map with ghost cells; (0, 0) drops the ghosts."""
     rows, columns = u.shape[0] - 2, u.shape[1] - 2
     return u[1 + di : 1 + di + rows, 1 + dj : 1 + dj + columns]

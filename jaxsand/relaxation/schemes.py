@@ -125,7 +125,7 @@ class Multilevel:
 
     Attributes:
         handover: time after which the next coarser grid takes over, at least 1; static.
-        coarsest: cells across the narrower side of the coarsest grid, at least 2; static.
+        coarsest: least number of cells across the narrower side of the coarsest grid, 2 or more; static.
         growth: length of a step over the time elapsed, see `SuperTimeStepping`; static.
         first: rate of the first sweep, see `SuperTimeStepping`; static.
         safety: share of the largest stable rate that is used; static.
@@ -155,7 +155,7 @@ Scheme = Relaxation | Pairwise | SuperTimeStepping | Multilevel
 
 
 def stable_rate(scene: Scene) -> float:
-    """The largest stable rate of a sweep: above it, the shortest wave that the grid holds grows."""
+    """The largest stable rate of a sweep in this scene: above it, the shortest wave on the grid grows."""
     if 1 in scene.grid.shape:
         return 1 / 4 if isinstance(scene.edge, Draining) else 1 / 2
     return {4: 1 / 4, 8: 1 / (2 + 2 * 2**0.5), "isotropic": 1 / 4}[scene.grid.neighbours]

@@ -1,45 +1,50 @@
-"""One sweep of settling: every link passes on its flux (flux.py), times a rate, cut to whole quanta (ghost_cells.py)."""
+"""One sweep of settling: every link moves its flux (flux.py) times a rate, cut to whole quanta (ghost_cells.py)."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import Plain, split
+from jaxsand.autodiff.while_loop import Plain, Tree, split
 from jaxsand.relaxation import flux_adjoint as adjoint
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
+
+Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Flow:
-    """How far a sweep goes: the share of the excess that crosses a straight link, and the quantum it is cut to (m)."""
+    """The size of a sweep: the share of the excess that crosses a straight link, and the quantum of fluxes (m)."""
 
-    rate: jax.Array
-    quantum: jax.Array
+    rate: Float[Array, ""]
+    quantum: Float[Array, ""]
 
 
-def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """One sweep of a map with halo [H + 2, W + 2].
+def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
+    """One sweep of a map with ghost cells [H + 2, W + 2], by forward Euler.
 
-    `lost` gathers the height that left each cell over a draining rim (see `lose`); None where nothing drains.
+    `lost` adds up the height that each cell lost over a draining rim (see `lose`); it is None where the edge is closed.
     """
     return apply(bed, flow, counted(flow, fluxes(bed, around, u)), u, lost)
 
 
 def counted(flow: Flow, driven: Fluxes) -> Fluxes:
-    """The whole quanta that cross the links for the fluxes at rate 1."""
+    """The numbers of quanta that cross the links in a sweep, from the fluxes at rate 1."""
     scale = flow.rate / flow.quantum
     return lax.optimization_barrier(tuple(truncate(f * scale) for f in driven))
 
 
 def surge(
-    bed: Bed, flow: Flow, momentum: jax.Array, around: Nothing | Partial, state: tuple[jax.Array, Lost, Fluxes]
-) -> tuple[jax.Array, Lost, Fluxes]:
-    """A sweep that also repeats the share `momentum` of what each link moved in the last one (quanta)."""
+    bed: Bed, flow: Flow, momentum: Float[Array, ""], around: Nothing | Partial, state: tuple[Ghosted, Lost, Fluxes]
+) -> tuple[Ghosted, Lost, Fluxes]:
+    """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before.
+
+    The state is a map with ghost cells, its account of losses, and what links moved last (in quanta).
+    """
     u, lost, last = state
     scale = flow.rate / flow.quantum
     moved = tuple(truncate(f * scale) + truncate(m * momentum) for f, m in zip(fluxes(bed, around, u), last, strict=True))
@@ -48,27 +53,36 @@ def surge(
     return u, lost, moved
 
 
-def apply(bed: Bed, flow: Flow, moved: Fluxes, u: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """The map with halo after whole quanta `moved` over its links; stored ones, lest each end compute its own."""
+def apply(bed: Bed, flow: Flow, moved: Fluxes, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
+    """The map with ghost cells after `moved` quanta crossed its links.
+
+    `moved` must be stored, behind a barrier, so that both ends of a link use the same number.
+    """
     h, lost = pass_over(bed, flow, moved, at(u), lost)
     return halo(h), lost
 
 
-def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
-    """`apply` to a map [H, W] without halo."""
+def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"], lost: Lost) -> tuple[Float[Array, "H W"], Lost]:
+    """`apply` for a map [H, W] without ghost cells."""
     if lost is not None:
         lost = lose(flow.quantum, lost, moved[-1] * flow.quantum)
     return h + gained(bed, moved) * flow.quantum, lost
 
 
 class Sweep(Plain):
-    """A sweep as a step of a loop; `params` are the bed, the flow and what is around, the state a map and what it lost."""
+    """A sweep as a step of a loop. `params` are the bed, the flow and the cells; the state is a map and its losses."""
 
     def __init__(self) -> None:
         super().__init__(lambda params, _, state: sweep(*params, *state))
 
-    def pull(self, params: Any, k: jax.Array, record: Any, cotangent: Any) -> tuple[Any, Any]:
-        """By hand where sand flows in pairs: from the heights, which tell the links that were active."""
+    def pull(
+        self,
+        params: tuple[Bed, Flow, Nothing | Partial],
+        k: jax.Array,
+        record: tuple[jax.Array, Lost],
+        cotangent: tuple[jax.Array, Lost],
+    ) -> tuple[Tree, tuple[jax.Array, Lost]]:
+        """The vjp, with 4 or 8 neighbours and a closed edge by the formulas of flux_adjoint.py, else by JAX."""
         bed, flow, around = params
         if bed.neighbours == "isotropic" or bed.rim is not None:
             return super().pull(params, k, record, cotangent)

@@ -14,8 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 class AsNeeded:
     """The simulator chooses a window from the blade's size, and enlarges it as needed; the default of `make_scene`.
 
-    A `SteppedPush` of a `Blade` computes only a window around the blade. If sand reaches the window's edge, the push is
-    computed again in a window twice as wide, and in the end on the whole map. Inside `jit`, `grad` and `vmap`, where no
+    A `SteppedPush` of a `Blade` computes only a window around the blade; on very wide maps the settling after it, too, is
+    computed in a window. If sand reaches a window's edge, all is computed again with a window twice as wide, and in the end
+    on the whole map. Inside `jit`, `grad` and `vmap`, where no
     second try is possible, the window is half as wide again to begin with, and the outcome says WINDOW_EDGE if it was too
     small: give `Window(size)` or `Whole()` then. Every other computation uses the whole map.
 
