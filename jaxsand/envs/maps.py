@@ -13,7 +13,7 @@ from jaxsand.planning.binary import Cell, make_problem, plan
 from jaxsand.planning.binary.board import MOVES
 
 STEPS = np.array([*MOVES.values()], np.int32)
-"""Rows and columns that N, E, S and W go on, in that order."""
+"""The changes of row and column by a step north, east, south and west, [4, 2]."""
 
 
 @jax.tree_util.register_dataclass

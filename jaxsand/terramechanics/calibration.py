@@ -65,7 +65,7 @@ class Trial:
     Example:
       >>> column = np.zeros((8, 8))
       >>> column[3:5, 3:5] = 0.02
-      >>> trial = js.Trial(before=column, after=np.zeros((8, 8)))
+      >>> trial = js.Trial(before=column, after=np.full((8, 8), 0.00125))
       >>> trial.stroke is None
       True
     """

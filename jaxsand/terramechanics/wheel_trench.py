@@ -383,7 +383,7 @@ def trimmed(profile: Profile, least: float) -> Profile:
       least: heights (m) nearer to 0 count as level.
 
     Returns:
-      The profile from the last level point before the trench to the first one after it.
+      The profile from the last level point before the trench to the first one after it; of a level profile, its two ends.
 
     Example:
       >>> wide = js.trench.Profile(np.arange(5.0), np.array([0.0, 0.0, -1.0, 0.0, 0.0]))

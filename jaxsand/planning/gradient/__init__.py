@@ -61,6 +61,9 @@ class Blurred:
     Args:
       cells: standard deviations of the Gaussians, in cells, in the order in which they are used.
 
+    Raises:
+      ValueError: for a number that is not above 0.
+
     Example:
       >>> js.Blurred((2.0, 1.0)).cells
       (2.0, 1.0)
@@ -100,7 +103,8 @@ def optimise_strokes(
       budget: how many calls of the simulator may be made; a push of one stroke is one call, its gradient four more.
       most: the largest number of pushes if `strokes` is None.
       smoothing: blurs the maps for the first steps; None does not.
-      guess: a plan [N, 4] (m) to start from, such as a policy's; None starts from a sketch.
+      guess: a plan [N, 4] (m) to start from, such as a policy's, with N = `strokes` if that is given; None starts from a
+        sketch.
       tell: is called with a line of progress.
 
     Returns:
