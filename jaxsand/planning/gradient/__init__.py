@@ -39,6 +39,8 @@ class Optimised:
       height: the map [H, W] (m) that `strokes` leave.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> found = js.optimise_strokes(scene, goal=jnp.zeros((16, 16)), strokes=1)
       >>> found.strokes.shape, found.spent
@@ -65,6 +67,7 @@ class Blurred:
       ValueError: for a number that is not above 0.
 
     Example:
+      >>> import jaxsand as js
       >>> js.Blurred((2.0, 1.0)).cells
       (2.0, 1.0)
     """
@@ -117,6 +120,8 @@ def optimise_strokes(
     The first call for a shape of map compiles, which takes about half a minute on two cores.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> js.optimise_strokes(scene, goal=jnp.zeros((16, 16)), strokes=1).losses.tolist()
       [0.0]

@@ -32,6 +32,8 @@ class SandPlan:
       effort: how many pushes were simulated, in full and roughly.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> found = js.plan_sand(scene, np.zeros((16, 16)), np.zeros((16, 16)), strokes=1)
       >>> found.strokes.shape, found.gap, found.reduction
@@ -97,6 +99,8 @@ def plan_sand(
       OutcomeError: if the sand does not come to rest.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> js.plan_sand(scene, np.zeros((16, 16)), np.zeros((16, 16)), strokes=1).paths
       ()
