@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from train.runs.runs import Learner
 
 MINUTES = {"hindsight": 30.0, "dqn": 10.0, "ddpg": 10.0}
-"""How long each learner trains unless it is told."""
+"""How many minutes each learner trains by default."""
 
 EPISODES = 10_000
-"""Of the paper's setting."""
+"""The number of training episodes in the paper's setting."""
 
 SHIPPED = Path(jaxsand.__file__).parent / "data" / "policy.npz"
-"""Where the policy lies that jaxsand comes with."""
+"""The file of the policy that comes with jaxsand."""
 
 _REPORT = "evaluate.json"
 _POLISH = 4_000  # calls of the simulator for --refine

@@ -43,7 +43,7 @@ def without_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget
     account, rng = Account(sand, budget), np.random.default_rng(seed)
     plans = first(account, print_of(account), n_strokes, rng)
     if plans is not None:
-        plan = reordered(account, plans)[0][0]
+        plan = reordered(account, plans).strokes[0]
         width = 2e-3
         while account.room(n_strokes):
             last = account.best.loss

@@ -113,6 +113,8 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
       ValueError: for a name or an option that does not exist, or a value that is out of range.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> env, params = js.make("single-stroke", limit=20)
       >>> obs, state = env.reset(jax.random.key(0), params)
       >>> obs["goal"].shape, obs["goal"].dtype

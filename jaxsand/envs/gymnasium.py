@@ -109,6 +109,7 @@ class SingleStrokeEnv(_Sand):
       **options: those of `jaxsand.make("single-stroke", ...)`.
 
     Example:
+      >>> import jaxsand as js
       >>> env = js.gym.SingleStrokeEnv(limit=20)
       >>> obs, info = env.reset(seed=0)
       >>> obs["goal"].shape, env.action_space
@@ -134,6 +135,8 @@ class MultiStrokeEnv(_Sand):
       **options: those of `jaxsand.make("multi-stroke", ...)`.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> env = js.gym.MultiStrokeEnv(goals=np.zeros((1, 8, 8)), scene=js.make_scene((8, 8), 0.01, tool=js.Blade()))
       >>> obs, info = env.reset(seed=0)
       >>> obs["desired_goal"].shape, env.action_space.shape
@@ -196,6 +199,7 @@ class SandVectorEnv(VectorEnv):
       **options: those of `jaxsand.make`.
 
     Example:
+      >>> import jaxsand as js
       >>> envs = js.gym.SandVectorEnv("single-stroke", num_envs=3)
       >>> obs, info = envs.reset(seed=0)
       >>> obs["goal"].shape
@@ -263,6 +267,8 @@ def picture(core: Core, shown: Obs) -> np.ndarray:
       [height, width, 3] (uint8).
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> env, params = js.make("single-stroke")
       >>> planes = {name: np.zeros((7, 7)) for name in ("goal", "current", "pose")}
       >>> js.gym.picture(env, planes).shape

@@ -33,6 +33,8 @@ class RandomStrokes:
       shortest: the least length of a stroke, as a share of the square's side, up to a half.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> plans = js.env.RandomStrokes(goals=2, fewest=3, most=3).plans(np.random.default_rng(0))
       >>> len(plans), plans[0].shape
       (2, (3, 4))
@@ -60,6 +62,8 @@ class Level:
     """Tells `make` to begin from level sand at height 0, the default.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), starts=js.env.Level())
       >>> params.goals.goals.shape
       (1, 32, 32)
@@ -75,6 +79,7 @@ class Rough:
       scale: over how many cells it is smooth.
 
     Example:
+      >>> import jaxsand as js
       >>> js.env.Rough(relief=0.02).scale
       3.0
     """
@@ -104,6 +109,8 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
       ValueError: for goals of the wrong type, without any goal, or not of the scene's shape.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
       >>> pool = js.env.library(js.env.MultiStroke(), scene, np.zeros((2, 8, 8)), js.env.Level(), seed=0)
       >>> pool.goals.shape

@@ -13,7 +13,7 @@ from jaxsand.planning.binary import Cell, make_problem, plan
 from jaxsand.planning.binary.board import MOVES
 
 STEPS = np.array([*MOVES.values()], np.int32)
-"""Rows and columns that N, E, S and W go on, in that order."""
+"""The changes of row and column by a step north, east, south and west, [4, 2]."""
 
 
 @jax.tree_util.register_dataclass
@@ -26,6 +26,9 @@ class MapPool:
       starts: (row, column) of the first cell, [G, 2].
 
     Example:
+      >>> import jax
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> pool = js.env.map_pool([np.ones((2, 2), bool)])
       >>> dig, start = pool.draw(jax.random.key(0), (2, 2))
       >>> int(dig.sum())
@@ -56,6 +59,8 @@ class Walks:
       straight: the probability to go straight on.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> dig, start = js.env.Walks(shortest=3, longest=3).draw(jax.random.key(0), (7, 7))
       >>> bool(dig[start[0], start[1]])
       True
@@ -103,6 +108,8 @@ def pool_of(goals: MapGoals, key: jax.Array, count: int, shape: tuple[int, int] 
       A `MapPool`.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> js.env.pool_of(js.env.Walks(), jax.random.key(0), count=5).dig.shape
       (5, 7, 7)
     """
@@ -123,6 +130,8 @@ def map_pool(maps: Sequence[np.ndarray] | np.ndarray, starts: Sequence[Cell | No
       ValueError: for maps of different shapes, one that is empty or falls into pieces, or a start that is not to be dug.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> js.env.map_pool([np.ones((2, 3), bool)], starts=[(0, 1)]).starts.tolist()
       [[0, 1]]
     """

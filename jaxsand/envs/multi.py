@@ -21,6 +21,7 @@ class NoStop:
     """Tells `MultiStroke` that an episode ends only when it is truncated, the default.
 
     Example:
+      >>> import jaxsand as js
       >>> js.env.MultiStroke().stop
       NoStop()
     """
@@ -38,6 +39,8 @@ class Stop:
     """Tells `MultiStroke` that actions have a fifth number, which ends the episode in place of a push when it is above 0.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), stop=js.env.Stop())
       >>> env.action_space(params).shape
       (5,)
@@ -56,6 +59,8 @@ class WithBerms:
     """Tells `MultiStroke` to compare maps as they are, the default: for goals that strokes made.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> float(js.env.WithBerms().seen(jnp.float32(2.0)))
       2.0
     """
@@ -70,6 +75,8 @@ class OnlyDug:
     """Tells `MultiStroke` to compare what is dug, min(h, 0): for goals that are drawn without berms.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> float(js.env.OnlyDug().seen(jnp.float32(2.0)))
       0.0
     """
@@ -88,6 +95,9 @@ class LevelGoals:
       goals: maps [G, H, W] (m).
 
     Example:
+      >>> import jax
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> start, goal = js.env.LevelGoals(jnp.ones((3, 8, 8))).draw(jax.random.key(0))
       >>> float(start.max()), float(goal.min())
       (0.0, 1.0)
@@ -111,6 +121,9 @@ class RoughGoals:
       starts: maps [G, H, W] (m), at rest.
 
     Example:
+      >>> import jax
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> start, goal = js.env.RoughGoals(jnp.ones((3, 8, 8)), jnp.zeros((3, 8, 8))).draw(jax.random.key(0))
       >>> float(start.max()), float(goal.min())
       (0.0, 1.0)
@@ -136,6 +149,8 @@ class StrokeState:
       time: strokes so far.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> state = js.env.StrokeState(jnp.zeros((8, 8)), jnp.zeros((8, 8)), jnp.int32(0))
       >>> int(state.time)
       0
@@ -157,6 +172,8 @@ class StrokeParams:
       limit: strokes after which an episode is truncated.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), limit=3)
       >>> params.limit
       3
@@ -189,6 +206,10 @@ class MultiStroke:
       settle: when settling stops; None means when the sand is still.
 
     Example:
+      >>> import jax
+      >>> import jax.numpy as jnp
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)))
       >>> obs, state = env.reset(jax.random.key(0), params)
       >>> obs["current"].shape

@@ -27,6 +27,8 @@ class MapState:
       time: steps so far.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> env, params = js.make("single-stroke")
       >>> obs, state = env.reset(jax.random.key(0), params)
       >>> int(state.dug.sum())
@@ -50,6 +52,7 @@ class MapParams:
       limit: steps after which an episode is truncated.
 
     Example:
+      >>> import jaxsand as js
       >>> js.env.MapParams(limit=20).step_cost
       0.0
     """
@@ -76,6 +79,8 @@ class OnMap:
       shape: of the maps.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> env, params = js.make("single-stroke", on=js.env.OnMap((5, 5)))
       >>> obs, state = env.reset(jax.random.key(0), params)
       >>> obs["pose"].shape

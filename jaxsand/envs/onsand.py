@@ -28,6 +28,8 @@ class SandState:
       height: the sand [H, W] (m) with the blade down, before it is lifted.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> env, params = js.make("single-stroke", on=js.env.OnSand((2, 2)))
       >>> obs, state = env.reset(jax.random.key(0), params)
       >>> state.height.shape
@@ -50,6 +52,7 @@ class SandParams:
       limit: steps after which an episode is truncated.
 
     Example:
+      >>> import jaxsand as js
       >>> env, params = js.make("single-stroke", on=js.env.OnSand((2, 2)), limit=9)
       >>> params.limit
       9
@@ -85,6 +88,8 @@ class OnSand:
       push: how the blade pushes.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> env, params = js.make("single-stroke", on=js.env.OnSand((2, 2)))
       >>> obs, state = env.reset(jax.random.key(0), params)
       >>> obs["pose"].shape

@@ -39,6 +39,8 @@ class Together:
     """Tells `MultiStroke` to push a batch all at once, which takes as long as its longest stroke: suits a GPU.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> env, params = js.make("multi-stroke", goals=np.zeros((1, 32, 32)), batching=js.env.Together())
       >>> env.batching
       Together()
@@ -60,6 +62,7 @@ class ByLength:
       ValueError: for a chunk below 1.
 
     Example:
+      >>> import jaxsand as js
       >>> js.env.ByLength(chunk=16)
       ByLength(chunk=16)
     """

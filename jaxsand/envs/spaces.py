@@ -20,6 +20,8 @@ class Box:
       dtype: of the arrays.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> box = js.env.Box(-1, 1, (4,))
       >>> bool(box.contains(box.sample(jax.random.key(0))))
       True
@@ -55,6 +57,7 @@ class Discrete:
       n: how many.
 
     Example:
+      >>> import jaxsand as js
       >>> bool(js.env.Discrete(4).contains(4))
       False
     """
@@ -83,6 +86,8 @@ class Dict:
       spaces: the spaces by key.
 
     Example:
+      >>> import jax
+      >>> import jaxsand as js
       >>> space = js.env.Dict({"goal": js.env.Box(0, 1, (7, 7))})
       >>> space.sample(jax.random.key(0))["goal"].shape
       (7, 7)

@@ -30,6 +30,8 @@ def dug(height: jax.typing.ArrayLike, depth: jax.typing.ArrayLike) -> jax.Array:
       Booleans [..., H, W].
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> js.task.dug(jnp.array([0.0, -0.004]), depth=0.006).tolist()
       [False, True]
     """
@@ -48,6 +50,8 @@ def iou(goal: jax.typing.ArrayLike, height: jax.typing.ArrayLike, depth: jax.typ
       [...], 0 to 1; 1 where neither map has a dug cell.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> goal, height = jnp.array([[0.0, -0.006]]), jnp.array([[-0.006, -0.006]])
       >>> float(js.task.iou(goal, height, depth=0.006))
       0.5
@@ -69,6 +73,8 @@ def l2(goal: _Map, height: _Map) -> jax.Array:
       [...] (m). Differentiable where it is not 0.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> float(js.task.l2(jnp.zeros((2, 2)), jnp.ones((2, 2))))
       2.0
     """
@@ -90,6 +96,8 @@ def l2_reduction(goal: _Map, before: _Map, after: _Map) -> jax.Array:
     Source: arXiv:1908.02745.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> goal = jnp.full((2, 2), -1.0)
       >>> float(js.task.l2_reduction(goal, jnp.zeros((2, 2)), goal / 2))
       0.5
@@ -108,6 +116,8 @@ def below(height: _Map) -> jax.Array:
       [...] (m).
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> js.task.below(jnp.array([2.0, -1.0])).tolist()
       [0.0, -1.0]
     """
@@ -125,6 +135,7 @@ def volume_error(before: jax.typing.ArrayLike, after: jax.typing.ArrayLike) -> f
       A number, 0 when both sums are 0. Computed in float64 on the host.
 
     Example:
+      >>> import jaxsand as js
       >>> js.task.volume_error([[0.0, 0.0]], [[0.5, -0.25]])
       0.3333333333333333
     """
@@ -146,6 +157,8 @@ def map_goal(dig: np.ndarray, cell: int, margin: int, depth: float) -> np.ndarra
       [rows cell + 2 margin, columns cell + 2 margin] (m), row 0 at y = 0.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> js.task.map_goal(np.array([[True], [False]]), cell=1, margin=0, depth=0.01).tolist()
       [[-0.0], [-0.01]]
     """
@@ -167,6 +180,8 @@ def cell_centre(cells: np.ndarray, rows: int, cell: int, margin: int, spacing: f
       [n, 2] of x, y (m).
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> js.task.cell_centre(np.array([[1, 0]]), rows=2, cell=1, margin=0, spacing=0.01).tolist()
       [[0.005, 0.005]]
     """
@@ -187,6 +202,8 @@ def place(strokes: np.ndarray, square: tuple[float, float] = GLYPH_SQUARE) -> np
       [n, 4] (m).
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> js.task.place(np.array([[0.0, 0.0, 1.0, 0.5]]), square=(1.0, 3.0)).tolist()
       [[1.0, 1.0, 3.0, 2.0]]
     """
@@ -208,6 +225,8 @@ def resample(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
       The new map, of `shape`.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> js.task.resample(np.array([[0.0, 2.0], [4.0, 6.0]]), (1, 1)).tolist()
       [[3.0]]
     """
@@ -249,6 +268,8 @@ def fits(scene: Scene, goal: np.ndarray, name: str = "goal") -> None:
       ValueError: if it has another shape, or a cell that is not finite.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> js.task.fits(js.make_scene((4, 4), 0.01), np.zeros((4, 4)))
     """
     if goal.shape != scene.grid.shape:
@@ -273,6 +294,8 @@ def finite(goal: np.ndarray, name: str = "goal") -> None:
       ValueError: if a cell is not finite; it says how many.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> js.task.finite(np.array([[np.nan]]))
       Traceback (most recent call last):
         ...

@@ -15,11 +15,11 @@ from jaxsand.interaction.batched import step_batch, value_and_grad_batch
 from jaxsand.scene.scene import Scene
 
 GRADIENT = 4
-"""Calls that going back through one stroke costs, as `jaxsand bench grad` measures it, rounded up."""
+"""The cost of the gradient through one stroke in calls, as `jaxsand bench grad` measures it, rounded up."""
 
 
 Weigh = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""A loss of differences [P, H, W] (m): its values [P], and its gradient [P, H, W]."""
+"""From differences [P, H, W] (m) to a loss of them [P] and its gradient [P, H, W]."""
 
 
 @dataclass(frozen=True)

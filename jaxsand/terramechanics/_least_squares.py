@@ -50,6 +50,7 @@ class Verdict(IntFlag):
         and `errors` hold the noise's part alone.
 
     Example:
+      >>> import jaxsand as js
       >>> verdict = js.Verdict.AT_LIMIT | js.Verdict.POOR_FIT
       >>> js.Verdict.AT_LIMIT in verdict
       True
@@ -94,6 +95,9 @@ class Calibration(Generic[Model]):
       model: the model with the values put in: a `Scene`, or a tuple of wheel passes.
 
     Example:
+      >>> import math
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> run = js.trench.Pass(slip_angle=math.radians(45), sinkage=0.015)
       >>> x = np.linspace(-0.1, 0.1, 101)
       >>> section = js.Section(run, x, js.trench.closed_form(run)(x))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 Reference = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, bool]]
-"""At x: the reference's misfits m_fine - d (m), what its limit adds to them, b, and whether both grids came out clean."""
+"""From x to the misfits m_fine - d (m), what the limit adds to them, b, and whether both outcomes were clean."""
 
 _LOOKS = 12
 _NEAR = 0.5  # of its own error: a step after which the fit has arrived

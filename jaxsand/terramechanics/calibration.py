@@ -65,9 +65,11 @@ class Trial:
       stroke: x0, y0, x1, y1 (m) of one push [4], or of pushes one after the other [n, 4]; None where the sand only settles.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> column = np.zeros((8, 8))
       >>> column[3:5, 3:5] = 0.02
-      >>> trial = js.Trial(before=column, after=np.zeros((8, 8)))
+      >>> trial = js.Trial(before=column, after=np.full((8, 8), 0.00125))
       >>> trial.stroke is None
       True
     """
@@ -126,6 +128,9 @@ def calibrate(
     doi:10.1098/rsta.1911.0009.
 
     Example:
+      >>> import math
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> column = jnp.zeros((9, 9)).at[3:6, 3:6].set(0.03)
       >>> sand = js.make_scene((9, 9), 0.01, repose_angle=math.radians(30), neighbours=4)
       >>> guess = js.make_scene((9, 9), 0.01, repose_angle=math.radians(27), neighbours=4)

@@ -21,6 +21,7 @@ class TwoGrids:
     """Tells `calibrate` to find the grid's error, from isotropic sand on the scene's grid and on one three times as fine.
 
     Example:
+      >>> import jaxsand as js
       >>> js.TwoGrids()
       TwoGrids()
     """
@@ -31,6 +32,8 @@ class OneGrid:
     """Tells `calibrate` to leave the grid's error unknown: it runs faster, and its errors hold the noise's part alone.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> trial = js.Trial(np.zeros((8, 8)), np.zeros((8, 8)))
       >>> js.calibrate(js.make_scene((8, 8), 0.01), trial, free=["repose_angle"], grid=js.OneGrid())  # doctest: +SKIP
 

@@ -46,6 +46,7 @@ class Soil:
       shear_displacement: K, the length over which shear stress builds up (m).
 
     Example:
+      >>> import jaxsand as js
       >>> import dataclasses
       >>> clean = dataclasses.replace(js.forces.WONG_DRY_SAND, cohesion=0.0)
       >>> clean.cohesion
@@ -86,6 +87,7 @@ class Cut:
       sides: how many upright faces the wedge tears off along: 0 in plane strain (a wide blade), 2 in the open.
 
     Example:
+      >>> import jaxsand as js
       >>> js.forces.Cut(depth=0.02, width=0.1).sides
       0.0
     """
@@ -107,6 +109,7 @@ class BladeForce:
       lift: upward (N).
 
     Example:
+      >>> import jaxsand as js
       >>> force = js.forces.cut_force(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.02, width=0.1))
       >>> bool(force.draught > force.lift > 0)
       True
@@ -128,6 +131,7 @@ class WheelForce:
       resistance: compaction resistance (N).
 
     Example:
+      >>> import jaxsand as js
       >>> force = js.forces.wheel_force(js.forces.WONG_DRY_SAND, 0.048, 0.05, sinkage=0.01, slip=0.2)
       >>> bool(force.load > force.resistance > 0)
       True
@@ -156,6 +160,9 @@ def wedge_factors(soil: Soil, rake: Scalar, angle: Scalar) -> tuple[jax.Array, j
     Source: McKyes 1985, "Soil Cutting and Tillage", multiplied out.
 
     Example:
+      >>> import math
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> weight, cohesion, adhesion, surcharge = js.forces.wedge_factors(js.forces.WONG_DRY_SAND, math.pi / 2, 0.5)
       >>> bool(jnp.isclose(weight, surcharge / 2))
       True
@@ -181,6 +188,8 @@ def failure_angle(soil: Soil, cut: Cut) -> jax.Array:
       b (rad), or NaN if the interval is empty, so that no wedge can slide. Derivatives treat b as a constant.
 
     Example:
+      >>> import math
+      >>> import jaxsand as js
       >>> angle = js.forces.failure_angle(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.02, width=0.1))
       >>> round(math.degrees(angle))
       21
@@ -216,6 +225,7 @@ def cut_force(soil: Soil, cut: Cut) -> BladeForce:
     Source: Reece 1964, doi:10.1243/PIME_CONF_1964_179_134_02; McKyes 1985.
 
     Example:
+      >>> import jaxsand as js
       >>> shallow = js.forces.cut_force(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.01, width=0.1))
       >>> deep = js.forces.cut_force(js.forces.WONG_DRY_SAND, js.forces.Cut(depth=0.02, width=0.1))
       >>> bool(deep.draught > 2 * shallow.draught)
@@ -256,6 +266,8 @@ def blade_force(scene: Scene, height: jax.typing.ArrayLike, pose: Pose, soil: So
       ValueError: if the scene has no blade, or a value is out of range.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade(0.04, 0.02, 0.01))
       >>> pose = js.Pose(0.03, 0.04, 1.0, 0.0)
       >>> force = js.forces.blade_force(scene, jnp.zeros((8, 8)), pose, js.forces.WONG_DRY_SAND)
@@ -301,6 +313,7 @@ def wheel_force(soil: Soil, radius: Scalar, width: Scalar, sinkage: Scalar, slip
     Source: Bekker 1956, "Theory of Land Locomotion"; Janosi & Hanamoto 1961; Wong & Reece 1967, J. Terramechanics 4.
 
     Example:
+      >>> import jaxsand as js
       >>> soil = js.forces.WONG_DRY_SAND
       >>> slipping = js.forces.wheel_force(soil, radius=0.048, width=0.05, sinkage=0.01, slip=0.5)
       >>> gripping = js.forces.wheel_force(soil, radius=0.048, width=0.05, sinkage=0.01, slip=0.1)
@@ -344,6 +357,7 @@ def bekker_sinkage(soil: Soil, radius: Scalar, width: Scalar, load: Scalar) -> j
     Source: Bekker 1956, "Theory of Land Locomotion".
 
     Example:
+      >>> import jaxsand as js
       >>> round(float(js.forces.bekker_sinkage(js.forces.WONG_DRY_SAND, radius=0.048, width=0.05, load=10.0)), 4)
       0.0103
     """
@@ -367,6 +381,7 @@ def bekker_resistance(soil: Soil, width: Scalar, sinkage: Scalar) -> jax.Array:
     Source: Bekker 1956, "Theory of Land Locomotion".
 
     Example:
+      >>> import jaxsand as js
       >>> round(float(js.forces.bekker_resistance(js.forces.WONG_DRY_SAND, width=0.05, sinkage=0.01)), 2)
       2.33
     """

@@ -35,6 +35,8 @@ class Section:
       ValueError: if x and z differ in shape, or x is not finite.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> run = js.trench.Pass(slip_angle=0.0, sinkage=0.01)
       >>> x = np.linspace(-0.1, 0.1, 101)
       >>> section = js.Section(run, x, js.trench.closed_form(run)(x))
@@ -91,6 +93,9 @@ def calibrate_sections(
     Source: Levenberg 1944; Marquardt 1963, doi:10.1137/0111030.
 
     Example:
+      >>> import math
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> run = js.trench.Pass(slip_angle=math.radians(45), sinkage=0.015)
       >>> guess = js.trench.Pass(slip_angle=math.radians(45), sinkage=0.012)
       >>> x = np.linspace(-0.1, 0.1, 101)

@@ -57,6 +57,7 @@ class Pass:
     Source: Pavlov & Johnson, ICRA 2019.
 
     Example:
+      >>> import jaxsand as js
       >>> run = js.trench.Pass(slip_angle=0.0, sinkage=0.01)
       >>> run.swept == run.width
       True
@@ -156,6 +157,8 @@ class Profile:
       z: heights [n] (m) at x.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> profile = js.trench.Profile(np.array([-1.0, 0.0, 1.0]), np.array([0.0, -0.5, 0.0]))
       >>> profile.deepest, profile.area()
       (0.5, -0.5)
@@ -213,6 +216,8 @@ def closed_form(run: Pass) -> Profile:
     Source: Pavlov & Johnson, ICRA 2019; see the head of this module for the symbols.
 
     Example:
+      >>> import math
+      >>> import jaxsand as js
       >>> profile = js.trench.closed_form(js.trench.Pass(slip_angle=math.radians(45), sinkage=0.015))
       >>> round(profile.deepest, 4)
       0.015
@@ -263,6 +268,7 @@ def unsettled(run: Pass) -> Profile:
       A `Profile`; where it jumps, two points have the same x.
 
     Example:
+      >>> import jaxsand as js
       >>> profile = js.trench.unsettled(js.trench.Pass(slip_angle=0.0, sinkage=0.01))
       >>> round(profile.deepest, 4)
       0.01
@@ -295,6 +301,8 @@ def cell_means(profile: Profile, edges: np.ndarray) -> np.ndarray:
       The mean heights [n] (m).
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> profile = js.trench.Profile(np.array([-1.0, 0.0, 1.0]), np.array([0.0, -0.5, 0.0]))
       >>> js.trench.cell_means(profile, np.array([-1.0, 0.0, 1.0])).tolist()
       [-0.25, -0.25]
@@ -325,6 +333,7 @@ def relaxed(runs: list[Pass], spacing: float = 5e-4) -> list[Profile]:
       ValueError: for no passes, or passes of different angles of repose.
 
     Example:
+      >>> import jaxsand as js
       >>> run = js.trench.Pass(slip_angle=0.0, sinkage=0.01)
       >>> exact = js.trench.relaxed([run], spacing=4e-3)[0]
       >>> abs(exact.deepest - js.trench.closed_form(run).deepest) < 2e-3
@@ -349,6 +358,7 @@ def relaxing(reach: float = 0.2, spacing: float = 1e-3) -> Callable[[Pass], Prof
       the reach.
 
     Example:
+      >>> import jaxsand as js
       >>> relax = js.trench.relaxing(reach=0.1, spacing=4e-3)
       >>> relax(js.trench.Pass(slip_angle=0.0, sinkage=0.01)).deepest > 0
       True
@@ -383,9 +393,11 @@ def trimmed(profile: Profile, least: float) -> Profile:
       least: heights (m) nearer to 0 count as level.
 
     Returns:
-      The profile from the last level point before the trench to the first one after it.
+      The profile from the last level point before the trench to the first one after it; of a level profile, its two ends.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> wide = js.trench.Profile(np.arange(5.0), np.array([0.0, 0.0, -1.0, 0.0, 0.0]))
       >>> js.trench.trimmed(wide, 1e-6).x.tolist()
       [1.0, 2.0, 3.0]

@@ -11,7 +11,7 @@ from jaxsand.__main__ import main
 from jaxsand.bench.stroke_goals import letters, many_strokes, stroke_goal
 from jaxsand.planning.gradient import as_many_as_pay, print_of, search
 from jaxsand.planning.gradient.account import Account
-from jaxsand.planning.gradient.moves import reordered
+from jaxsand.planning.gradient.moves import Plans, reordered
 from jaxsand.planning.gradient.sketch import guesses, printed, prints
 from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
 
@@ -85,9 +85,9 @@ def test_a_plan_in_the_wrong_order_and_direction_is_put_right(tee):
     counted = account(tee, 1000)
     wrong = tee.strokes[::-1].copy()
     wrong[0] = wrong[0, [2, 3, 0, 1]]
-    plans, losses = reordered(counted, (wrong[None], counted.losses(wrong[None])))
-    assert losses[0] < 1e-4 * counted.before
-    assert np.allclose(plans[0], tee.strokes) or losses[0] == 0
+    found = reordered(counted, Plans(wrong[None], counted.losses(wrong[None])))
+    assert found.losses[0] < 1e-4 * counted.before
+    assert np.allclose(found.strokes[0], tee.strokes) or found.losses[0] == 0
 
 
 def test_a_letter_is_found_within_the_budget_and_again_by_the_same_key(tee):

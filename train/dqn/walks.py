@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from train.dqn.learner import Dqn, Walking
 
 MOST = 3
-"""Steps for each cell."""
+"""A walk is given up after so many steps for each cell."""
 
 _Carry = tuple[dict[str, jax.Array], MapState, jax.Array, jax.Array]  # observations, states, steps taken, the step's number
 _Beam = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # dug, places, alive, steps taken, the step's number

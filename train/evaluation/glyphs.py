@@ -92,4 +92,4 @@ SETS: dict[str, Callable[[], list[StrokeGoal]]] = {
     "many": _many,
     "random": _few,
 }
-"""By name; `--goals NAME`."""
+"""The sets of glyphs by name, for `--goals NAME`."""

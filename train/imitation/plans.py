@@ -5,7 +5,7 @@ import numpy as np
 from jaxsand.goals.metrics import GLYPH_SQUARE
 
 MOST = 8
-"""Strokes of a plan, at most."""
+"""The most strokes of a plan."""
 
 _COUNTS = np.array([0.06, 0.16, 0.22, 0.22, 0.14, 0.10, 0.06, 0.04])
 _SHORTEST = 0.15  # of the square

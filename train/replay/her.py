@@ -15,7 +15,7 @@ Observation = jax.Array | dict[str, jax.Array]
 """A vector [B, N], or a dictionary of maps [B, H, W], one of them the "goal" and one "current"."""
 
 Judge = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
-"""From what there was before a step, what there is after it, and the goal, the reward and whether the episode terminates."""
+"""From `current` before a step and after it, and a goal, to the reward and whether the episode terminates."""
 
 
 @jax.tree_util.register_dataclass

@@ -67,6 +67,8 @@ def plan(
     Source: arXiv:1908.02745, section "Single Stroke", for the problem and the engine "paper".
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> tee = np.array([[True, True, True], [False, True, False]])
       >>> found = js.plan(tee, start=(0, 0))
       >>> found.path, found.steps, found.optimal

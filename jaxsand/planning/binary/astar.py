@@ -12,7 +12,7 @@ from jaxsand.planning.binary.bound import block_bound
 from jaxsand.planning.binary.plans import Found, heading
 
 LARGEST = 3000
-"""Cells; the bound needs the steps between any two."""
+"""The most cells of a map for A*: its bound needs a table of the steps between any two."""
 _State = tuple[int, int, int]  # cell, cells left as bits, the cell before (-1 where turns cost nothing)
 
 

@@ -24,6 +24,8 @@ class Plan:
       engine: the name of the search.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> found = js.plan(np.array([[True, True]]), start=(0, 0))
       >>> found.path, found.cells, found.gap
       ('E', ((0, 0), (0, 1)), 0.0)

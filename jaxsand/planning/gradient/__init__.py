@@ -39,6 +39,8 @@ class Optimised:
       height: the map [H, W] (m) that `strokes` leave.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> found = js.optimise_strokes(scene, goal=jnp.zeros((16, 16)), strokes=1)
       >>> found.strokes.shape, found.spent
@@ -61,7 +63,11 @@ class Blurred:
     Args:
       cells: standard deviations of the Gaussians, in cells, in the order in which they are used.
 
+    Raises:
+      ValueError: for a number that is not above 0.
+
     Example:
+      >>> import jaxsand as js
       >>> js.Blurred((2.0, 1.0)).cells
       (2.0, 1.0)
     """
@@ -100,7 +106,8 @@ def optimise_strokes(
       budget: how many calls of the simulator may be made; a push of one stroke is one call, its gradient four more.
       most: the largest number of pushes if `strokes` is None.
       smoothing: blurs the maps for the first steps; None does not.
-      guess: a plan [N, 4] (m) to start from, such as a policy's; None starts from a sketch.
+      guess: a plan [N, 4] (m) to start from, such as a policy's, with N = `strokes` if that is given; None starts from a
+        sketch.
       tell: is called with a line of progress.
 
     Returns:
@@ -113,6 +120,8 @@ def optimise_strokes(
     The first call for a shape of map compiles, which takes about half a minute on two cores.
 
     Example:
+      >>> import jax.numpy as jnp
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> js.optimise_strokes(scene, goal=jnp.zeros((16, 16)), strokes=1).losses.tolist()
       [0.0]
@@ -140,7 +149,7 @@ def optimise_strokes(
     if account.before > 0 and plan is None:
         search(account, strokes, rng, most, smoothing)
     elif account.before > 0 and plan is not None and len(plan):
-        improve(account, print_of(account), (plan[None], account.losses(plan[None])), rng, smoothing)
+        improve(account, print_of(account), moves.Plans(plan[None], account.losses(plan[None])), rng, smoothing)
     steps = [Best(0, account.before, np.zeros((0, 4))), *(best for best in account.history if best.loss < account.before)]
     found = steps[-1].strokes
     height = sand.maps(found[None])[0]
@@ -160,7 +169,8 @@ def search(
     plans = first(account, mark, count, rng)
     if plans is not None and np.ptp(account.sand.start) > 0:  # prints say little of rough sand
         felt = moves.stroke_by_stroke(account, count, account.room(count) * count // 2, rng)
-        plans = moves.ranked(np.concatenate([felt[0], plans[0]]), np.concatenate([felt[1], plans[1]]), 1)
+        both = felt.joined(plans)
+        plans = moves.ranked(both.strokes, both.losses, 1)
     if plans is not None:
         improve(account, mark, plans, rng, smoothing)
 
@@ -208,24 +218,18 @@ def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Ge
     plans = moves.reordered(account, plans)
     for blur in smoothing.cells if smoothing else ():
         plans = moves.adam(account, plans, _STEPS, 0.15 * dx, blur)
-    while account.best.loss > _REACHED * account.before and account.room(plans[0].shape[1]) > 0:
-        last, spent = plans[1][0], account.calls
+    while account.best.loss > _REACHED * account.before and account.room(plans.strokes.shape[1]) > 0:
+        last, spent = plans.losses[0], account.calls
         plans = moves.reordered(account, plans)
         plans = moves.adam(account, plans, 8, 0.1 * dx)
         plans = moves.replaced(account, mark, plans, rng)
-        front = moves.quasi_newton(account, (plans[0][:1], plans[1][:1]), 4)
-        plans = _joined(front, (plans[0][1:], plans[1][1:]))
-        if plans[1][0] > 0.98 * last:  # stuck: from beside the best plan
-            near = plans[0][:1] + rng.normal(0, 0.7 * dx, (_LANES - 1, *plans[0].shape[1:]))
+        plans = moves.quasi_newton(account, plans.part(slice(1)), 4).joined(plans.part(slice(1, None)))
+        if plans.losses[0] > 0.98 * last:  # stuck: from beside the best plan
+            near = plans.strokes[:1] + rng.normal(0, 0.7 * dx, (_LANES - 1, *plans.strokes.shape[1:]))
             near = np.clip(near, *account.sand.bounds)
-            plans = _joined((plans[0][:1], plans[1][:1]), (near, account.losses(near)))
+            plans = plans.part(slice(1)).joined(moves.Plans(near, account.losses(near)))
         if account.calls == spent:
             break
-
-
-def _joined(a: moves.Plans, b: moves.Plans) -> moves.Plans:
-    """Two sets of plans as one."""
-    return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
 
 
 def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:

@@ -1,9 +1,10 @@
 """Moves that improve plans: downhill by gradients, other orders and directions, strokes placed where the goal is not
 reached.
 
-A move takes plans [P, N, 4] (m) with their losses, closest first, and returns plans that are no worse.
+A move takes plans with their losses, closest first, and returns plans that are no worse.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -13,11 +14,26 @@ import optax
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses, swaps
 
-Plans = tuple[np.ndarray, np.ndarray]  # [P, N, 4] (m), closest first, and their losses [P] (m^2)
 _STEPS = (1.0, 0.3, 0.1, 0.03)  # lengths that a quasi-Newton step is tried at
 _MEMORY = 8  # gradients that the quasi-Newton steps remember
 _DRAWN = 32  # strokes that are tried at a time
 _TRIED = 3  # strokes that are tried in the place of one
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Plans of equally many strokes, `strokes` [P, N, 4] (m), and their `losses` [P] (m^2)."""
+
+    strokes: np.ndarray
+    losses: np.ndarray
+
+    def part(self, which: slice) -> "Plans":
+        """Some of the plans."""
+        return Plans(self.strokes[which], self.losses[which])
+
+    def joined(self, other: "Plans") -> "Plans":
+        """These plans, then the others."""
+        return Plans(np.concatenate([self.strokes, other.strokes]), np.concatenate([self.losses, other.losses]))
 
 
 def ranked(plans: np.ndarray, losses: np.ndarray, most: int) -> Plans:
@@ -28,12 +44,12 @@ def ranked(plans: np.ndarray, losses: np.ndarray, most: int) -> Plans:
             kept.append(int(i))
         if len(kept) == most:
             break
-    return plans[kept], losses[kept]
+    return Plans(plans[kept], losses[kept])
 
 
 def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 0.0) -> Plans:
     """Follows the gradient by Adam; its first step is `size` (m) long, its last a tenth of that."""
-    plans, losses = start[0].copy(), start[1].copy()
+    plans, losses = start.strokes.copy(), start.losses.copy()
     rule = optax.adam(optax.cosine_decay_schedule(size, max(steps, 1), 0.1), b2=0.95)
     here: Any = plans.copy()
     state = rule.init(here)
@@ -50,7 +66,7 @@ def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 
 
 def quasi_newton(account: Account, start: Plans, steps: int) -> Plans:
     """Follows the gradient by L-BFGS, every plan for itself; of four step lengths the best is taken."""
-    plans, losses = start[0].copy(), start[1].copy()
+    plans, losses = start.strokes.copy(), start.losses.copy()
     rule = optax.scale_by_lbfgs(_MEMORY)
     scale = 1e-3  # metres to about the size that gradients change over
     state = jax.vmap(rule.init)(plans / scale)
@@ -76,7 +92,7 @@ def quasi_newton(account: Account, start: Plans, steps: int) -> Plans:
 
 def reordered(account: Account, start: Plans) -> Plans:
     """Swaps two strokes of the best plan, or reverses one, as long as that helps."""
-    plans, losses = start
+    plans, losses = start.strokes, start.losses
     while True:
         plan, n = plans[0], plans.shape[1]
         others = list(plan[swaps(n)])
@@ -86,14 +102,15 @@ def reordered(account: Account, start: Plans) -> Plans:
             others.append(turned)
         far = account.losses(np.stack(others))
         better = float(far.min()) < losses[0] * 0.999
-        plans, losses = ranked(np.concatenate([plans, others]), np.concatenate([losses, far]), len(plans))
+        best = ranked(np.concatenate([plans, others]), np.concatenate([losses, far]), len(plans))
+        plans, losses = best.strokes, best.losses
         if not better:
-            return plans, losses
+            return best
 
 
 def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generator) -> Plans:
     """Moves one stroke of the best plan to where the others leave most to do, as the first, the last, or in its place."""
-    plans, losses = start
+    plans, losses = start.strokes, start.losses
     plan, n = plans[0], plans.shape[1]
     dx = float(account.sand.scene.grid.spacing)
     others = []
@@ -141,7 +158,7 @@ def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.
         if not np.isfinite(least):
             break
         here, plan = there, np.concatenate([plan, best[None]])
-    return plan[None], account.losses(plan[None])
+    return Plans(plan[None], account.losses(plan[None]))
 
 
 def _from_high_to_low(off: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -20,7 +20,7 @@ from jaxsand.planning.learned.network import Params, StrokeNet, judge, likeliest
 from jaxsand.scene.scene import Scene, blade_of
 
 SIDE = 32
-"""Cells along a side of what the network looks at; it learned on such maps."""
+"""The cells along a side of the maps that the network reads, and was trained on."""
 
 _STRIDE = 16  # between the looks at a larger map
 _SIZES = (1, 8, 64)  # of batches, so that a few programs serve all

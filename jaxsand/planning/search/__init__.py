@@ -26,12 +26,14 @@ class SandPlan:
       height: the map [H, W] (m) that `follow` makes of the paths, one after the other.
       before: l2 distance (m) of the start from the goal, sqrt(sum (h - goal)^2).
       after: l2 distance (m) of `height` from the goal.
-      lower_bound: proven: no plan of as many strokes comes closer than this (m).
+      lower_bound: proven: no plan of as many strokes as were allowed, however placed, comes closer than this (m).
       estimate: a guess (m) of what could be reached: what is left if every stroke gains as much as the best of all that were
         tried.
       effort: how many pushes were simulated, in full and roughly.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> found = js.plan_sand(scene, np.zeros((16, 16)), np.zeros((16, 16)), strokes=1)
       >>> found.strokes.shape, found.gap, found.reduction
@@ -97,6 +99,8 @@ def plan_sand(
       OutcomeError: if the sand does not come to rest.
 
     Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
       >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
       >>> js.plan_sand(scene, np.zeros((16, 16)), np.zeros((16, 16)), strokes=1).paths
       ()

@@ -23,6 +23,7 @@ class Lattice:
       longest: the longest stroke that is proposed or made, in grid spacings.
 
     Example:
+      >>> import jaxsand as js
       >>> js.Lattice(pitch=2.0).longest
       inf
     """
@@ -43,6 +44,7 @@ class Steps:
       margin: grid cells along the map's edge that the blocks keep clear of.
 
     Example:
+      >>> import jaxsand as js
       >>> js.Steps(cell=3, margin=1)
       Steps(cell=3, margin=1)
     """

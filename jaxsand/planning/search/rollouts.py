@@ -13,7 +13,7 @@ from jaxsand.relaxation.stopping import Sweeps
 from jaxsand.scene.scene import Scene
 
 CHEAP = 1 / 12
-"""What a rough push counts for, in full ones; `jaxsand bench sand` measures it."""
+"""The cost of a rough push in full pushes, as `jaxsand bench sand` measures it."""
 
 
 @dataclass(frozen=True)
