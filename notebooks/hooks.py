@@ -116,7 +116,7 @@ def _cell(value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     return str(value).replace("|", "\\|")
 
 
@@ -182,6 +182,7 @@ def executed(notebook: Path, size: str) -> tuple[str, dict[str, bytes]]:
 
 def _execute(source: str, name: str, size: str, kept: Path) -> None:
     import nbformat
+    from mkdocs.exceptions import PluginError
     from nbconvert import MarkdownExporter
     from nbconvert.preprocessors import ExecutePreprocessor
 
@@ -190,6 +191,8 @@ def _execute(source: str, name: str, size: str, kept: Path) -> None:
     ExecutePreprocessor(timeout=3600).preprocess(notebook, {"metadata": {"path": str(HERE)}})
     resources = {"unique_key": name, "output_files_dir": ""}
     page, resources = MarkdownExporter().from_notebook_node(notebook, resources)
+    if "<Figure size" in page:
+        raise PluginError(f"{name}.ipynb: a figure is told and not drawn; call plt.show() once before it")
     title, _, rest = page.strip().partition("\n")
     note = f"The outputs below were made when this site was built, at size `{size}`, by `notebooks/{name}.ipynb`."
     kept.mkdir(parents=True, exist_ok=True)

@@ -142,13 +142,13 @@ def test_documented_arguments_are_those_of_the_function():
 
 
 def test_a_report_becomes_tables(hooks):
-    rows = [{"name": "one | two", "seconds": 0.123456}, {"name": "three", "error": None}]
+    rows = [{"name": "one | two", "seconds": 0.123456}, {"name": "three", "seconds": 12345.6, "error": None}]
     report = {"command": "jaxsand bench push", "machine": "M", "commit": None, "date": "2026-01-02", "map": [32, 32]}
     page = hooks.report_page(json.loads(json.dumps(report | {"push_speed": rows})))
     assert "| command | jaxsand bench push |" in page
     assert "commit" not in page
     assert "### push speed" in page
-    assert "| one \\| two | 0.1235 |  |" in page
+    assert "| one \\| two | 0.1235 |  |\n| three | 12,346 |  |" in page
 
 
 def test_rooms_import_downwards_in_the_drawing(hooks):
