@@ -3,7 +3,7 @@
 import string
 from typing import Any
 
-from jaxsand.goals import letters as goals
+from jaxsand.goals import letters
 from jaxsand.planning.pipeline import Layout, glyph_target, map_target, shape
 from jaxsand.scene.progress import Tell, quiet
 
@@ -16,9 +16,9 @@ def bench_letters(tell: Tell = quiet) -> list[dict[str, Any]]:
     rows = []
     for letter in string.ascii_uppercase:
         tell(f"letter {letter}")
-        dig, start = goals.letter_map(letter)
+        dig, start = letters.letter_map(letter)
         planned = shape(map_target(dig, start, letter, Layout()))
-        own = shape(glyph_target(goals.letter_strokes(letter), letter))
+        own = shape(glyph_target(letters.letter_strokes(letter), letter))
         figures = planned.figures
         rows.append(
             {

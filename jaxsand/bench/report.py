@@ -17,15 +17,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.bench import analysis, complexity, expansions, piles, stability
-from jaxsand.bench import calibration as calibbench
-from jaxsand.bench import envs as envbench
-from jaxsand.bench import gradients as gradbench
-from jaxsand.bench import pushes as pushbench
-from jaxsand.bench import sand as sandbench
+from jaxsand.bench import (
+    analysis,
+    calibration,
+    complexity,
+    envs,
+    expansions,
+    gradients,
+    piles,
+    pushes,
+    sand,
+    stability,
+    trenches,
+    work_precision,
+)
 from jaxsand.bench import strokes as strokebench
-from jaxsand.bench import trenches as rutbench
-from jaxsand.bench import work_precision as workprec
 from jaxsand.bench.letters import bench_letters
 from jaxsand.bench.rivals.plain import compile_c, settle_numpy
 from jaxsand.bench.tables import as_table
@@ -68,41 +74,41 @@ def bench(
         report["chunks"] = analysis.chunks(*_pushed(batch), tell)
         report["peer"] = analysis.peer(max(1, batch // 16), tell)
         if grids:
-            report["reference"] = workprec.reference_check(tell)
-            report["work_precision"] = workprec.work_precision(workprec.ALL, tell, grids)
-            report["time_to_1_percent"] = workprec.time_to(report["work_precision"])
-            report["growth"] = workprec.growth(report["time_to_1_percent"])
+            report["reference"] = work_precision.reference_check(tell)
+            report["work_precision"] = work_precision.work_precision(work_precision.ALL, tell, grids)
+            report["time_to_1_percent"] = work_precision.time_to(report["work_precision"])
+            report["growth"] = work_precision.growth(report["time_to_1_percent"])
             report["sweeps_by_rate"] = analysis.sweeps_against_rate()
             report["sweeps_by_resolution"] = analysis.sweeps_against_resolution()
             report["activity"] = [analysis.activity()]
             report["piles"] = piles.piles(tell, grids + 1)
     if what in ("push", "all"):
-        report["push"] = pushbench.push_speed(max(1, batch // 4), tell)
+        report["push"] = pushes.push_speed(max(1, batch // 4), tell)
         if grids:
-            report["push_precision"] = pushbench.push_precision(max(1, batch // 256), tell)
-            report["push_heaps"] = pushbench.heaps(tell=tell)
-            report["push_by_spacing"] = pushbench.push_against_spacing(tell)
-            report["push_by_heading"] = pushbench.push_by_heading(tell)
-            report["push_continuity"] = pushbench.push_continuity(tell=tell)
-            report["push_long_path"] = pushbench.long_path(tell=tell)
+            report["push_precision"] = pushes.push_precision(max(1, batch // 256), tell)
+            report["push_heaps"] = pushes.heaps(tell=tell)
+            report["push_by_spacing"] = pushes.push_against_spacing(tell)
+            report["push_by_heading"] = pushes.push_by_heading(tell)
+            report["push_continuity"] = pushes.push_continuity(tell=tell)
+            report["push_long_path"] = pushes.long_path(tell=tell)
     if what in ("plan", "all"):
         report |= complexity.planning(tell)
         report["expansions"] = expansions.rows_of_expansions(tell)
     if what == "grad":
-        report |= gradbench.bench_grad(tell, larger)
+        report |= gradients.bench_grad(tell, larger)
     if what == "sand":
-        report["children"] = sandbench.children_per_second()
-        report["sand"] = sandbench.bench_sand(tell, seed=seed)
+        report["children"] = sand.children_per_second()
+        report["sand"] = sand.bench_sand(tell, seed=seed)
     if what == "strokes":
         report |= strokebench.bench_strokes(tell, **strokes)
     if what == "calibrate":
-        report["calibrate"] = calibbench.bench_calibrate(tell)
-        report["calibrate_cone"] = calibbench.bench_cone(tell)
+        report["calibrate"] = calibration.bench_calibrate(tell)
+        report["calibrate_cone"] = calibration.bench_cone(tell)
     if what == "trench":
-        report["trench_by_spacing"] = rutbench.against_spacing(tell, grids + 1)
-        report["trench_settles"] = rutbench.settling(tell)
+        report["trench_by_spacing"] = trenches.against_spacing(tell, grids + 1)
+        report["trench_settles"] = trenches.settling(tell)
     of_one_table = {
-        "env": lambda: envbench.bench_env(batch, tell),
+        "env": lambda: envs.bench_env(batch, tell),
         "stability": lambda: stability.stability(tell=tell),
         "letters": lambda: bench_letters(tell),
     }
@@ -215,7 +221,7 @@ def _pushed(batch: int) -> tuple[Scene, jax.Array]:
     scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
     level = jnp.zeros((_CELLS, _CELLS), jnp.float32)
     pushed = jax.jit(lambda s: jax.lax.map(lambda one: act(scene, level, one).height, s, batch_size=64))(
-        pushbench.random_strokes(batch)
+        pushes.random_strokes(batch)
     )
     return make_scene((_CELLS, _CELLS), _SPACING, _ANGLE), jax.block_until_ready(pushed)
 

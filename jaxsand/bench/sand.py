@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsand.bench.rivals import search as rivals
+from jaxsand.bench.rivals import search
 from jaxsand.bench.timing import race
 from jaxsand.interaction.simulate import step
 from jaxsand.planning.search import plan_sand
@@ -18,17 +18,17 @@ from jaxsand.planning.search.tasks import SAND_TASKS, SandTask, sand_task
 from jaxsand.scene.progress import Tell, quiet
 
 _STROKES: dict[str, Callable[..., Any]] = {
-    "binary plan": rivals.binary,
-    "greedy": rivals.greedy,
-    "greedy, ranked": rivals.greedy_ranked,
-    "greedy, restarted": rivals.greedy_restarted,
-    "random shooting": rivals.shooting,
-    "layers alone": rivals.layers,
+    "binary plan": search.binary,
+    "greedy": search.greedy,
+    "greedy, ranked": search.greedy_ranked,
+    "greedy, restarted": search.greedy_restarted,
+    "random shooting": search.shooting,
+    "layers alone": search.layers,
 }
 _STEPS: dict[str, Callable[..., Any]] = {
-    "binary plan": rivals.binary,
-    "greedy": rivals.greedy_steps,
-    "random shooting": rivals.random_walks,
+    "binary plan": search.binary,
+    "greedy": search.greedy_steps,
+    "random shooting": search.random_walks,
 }
 _SEARCH, _ALONE = "search", "layers alone"
 

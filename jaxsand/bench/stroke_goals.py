@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxsand.goals import letters as goals
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.goals.surfaces import terrain_surface
 from jaxsand.interaction.simulate import check, rollout
 from jaxsand.planning.stroke_loss import SandLoss
@@ -35,7 +35,7 @@ class StrokeGoal:
     start: np.ndarray
     goal: np.ndarray
     strokes: np.ndarray
-    size: float = task.GLYPH_SQUARE[1] - task.GLYPH_SQUARE[0]
+    size: float = metrics.GLYPH_SQUARE[1] - metrics.GLYPH_SQUARE[0]
 
     @property
     def sand(self) -> SandLoss:
@@ -50,7 +50,7 @@ class StrokeGoal:
 
     def iou(self, after: np.ndarray) -> float:
         """Of what is dug below the start."""
-        return float(task.iou(self.goal - self.start, after - self.start, self.depth))
+        return float(metrics.iou(self.goal - self.start, after - self.start, self.depth))
 
 
 def stroke_goal(name: str, strokes: np.ndarray, start: np.ndarray | None = None, scene: Scene | None = None) -> StrokeGoal:
@@ -65,7 +65,7 @@ def stroke_goal(name: str, strokes: np.ndarray, start: np.ndarray | None = None,
 
 def letters(names: str = string.ascii_uppercase) -> list[StrokeGoal]:
     """Capital letters on level sand."""
-    return [stroke_goal(name, task.place(goals.letter_strokes(name))) for name in names]
+    return [stroke_goal(name, metrics.place(goals.letter_strokes(name))) for name in names]
 
 
 def turned_letters(names: str = string.ascii_uppercase, degrees: float = 30.0) -> list[StrokeGoal]:
@@ -76,7 +76,7 @@ def turned_letters(names: str = string.ascii_uppercase, degrees: float = 30.0) -
     for name in names:
         points = (goals.letter_strokes(name).reshape(-1, 2) - 0.5) @ turn
         points *= min(1.0, 0.5 / np.abs(points).max())
-        out.append(stroke_goal(f"{name} turned by {degrees:g}", task.place((points + 0.5).reshape(-1, 4))))
+        out.append(stroke_goal(f"{name} turned by {degrees:g}", metrics.place((points + 0.5).reshape(-1, 4))))
     return out
 
 
@@ -86,7 +86,7 @@ def letters_on_rough_sand(names: str = string.ascii_uppercase, relief: float = 0
     rested = settle(scene, terrain_surface(scene.grid.shape, relief).astype(np.float32), stop=UntilStill(bound=200_000))
     check(rested)
     rough = np.asarray(rested.height)
-    return [stroke_goal(f"{name} on rough sand", task.place(goals.letter_strokes(name)), rough) for name in names]
+    return [stroke_goal(f"{name} on rough sand", metrics.place(goals.letter_strokes(name)), rough) for name in names]
 
 
 def many_strokes(count: int = 8, goals: int = 5, seed: int = 0) -> list[StrokeGoal]:
@@ -96,7 +96,7 @@ def many_strokes(count: int = 8, goals: int = 5, seed: int = 0) -> list[StrokeGo
     for k in range(goals):
         drawn = rng.random((64 * count, 4))
         long = drawn[np.hypot(*(drawn[:, 2:] - drawn[:, :2]).T) >= 0.25][:count]
-        out.append(stroke_goal(f"{count} strokes, {k + 1}", task.place(long)))
+        out.append(stroke_goal(f"{count} strokes, {k + 1}", metrics.place(long)))
     return out
 
 

@@ -10,14 +10,14 @@ from jaxsand.cli.printing import lines, plain_name, read_cell, show
 
 def run_plan(options: argparse.Namespace) -> None:
     tell = progress()
-    from jaxsand.goals import letters as goals
+    from jaxsand.goals import letters
     from jaxsand.planning.binary import plan
 
     own: tuple[int, int] | None
     if len(options.map) == 1:
-        dig, own = goals.letter_map(options.map.upper() if options.map.isascii() else options.map)
+        dig, own = letters.letter_map(options.map.upper() if options.map.isascii() else options.map)
     else:
-        dig, own = goals.read_text_map(read_text(Path(options.map)), options.map)
+        dig, own = letters.read_text_map(read_text(Path(options.map)), options.map)
     start = own if options.start is None else read_cell(options.start)
     out = folder(options.out) if options.out else None
     tell("planning")

@@ -15,9 +15,9 @@ def run_settle(options: argparse.Namespace) -> None:
     tell = progress()
     if options.out_file.suffix != ".npy":
         raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")
-    from jaxsand.goals import letters as goals
+    from jaxsand.goals import letters
 
-    heights = goals.read_heights(existing(options.input))
+    heights = letters.read_heights(existing(options.input))
     import jax
     import numpy as np
 

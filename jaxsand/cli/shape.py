@@ -149,9 +149,8 @@ def _summary(report: dict[str, Any]) -> str:
 
 
 def _target(options: argparse.Namespace) -> "Target":
-    from jaxsand.goals import letters as goals
-    from jaxsand.goals import surfaces
-    from jaxsand.planning import pipeline as shaping
+    from jaxsand.goals import letters, surfaces
+    from jaxsand.planning import pipeline
 
     name, method = options.goal, options.method
     path = Path(name)
@@ -166,24 +165,24 @@ def _target(options: argparse.Namespace) -> "Target":
             if getattr(options, option) is not None:
                 raise ValueError(f"{option.replace('_', '-')}: has no effect on a glyph's own strokes; leave it out")
         letter = name.upper() if len(name) == 1 and name.isascii() and name.isalpha() else ""
-        return shaping.glyph_target(goals.letter_strokes(letter) if letter else goals.text_strokes(name), name)
+        return pipeline.glyph_target(letters.letter_strokes(letter) if letter else letters.text_strokes(name), name)
     start = read_cell(options.start)
     if len(name) == 1:
-        dig, own = goals.letter_map(name.upper() if name.isascii() else name)
-        return shaping.map_target(dig, start if options.start else own, name.upper(), _layout(options))
+        dig, own = letters.letter_map(name.upper() if name.isascii() else name)
+        return pipeline.map_target(dig, start if options.start else own, name.upper(), _layout(options))
     if suffix == ".txt":
-        dig, marked = goals.read_text_map(read_text(path), str(path))
-        return shaping.map_target(dig, start if options.start else marked, path.stem, _layout(options))
+        dig, marked = letters.read_text_map(read_text(path), str(path))
+        return pipeline.map_target(dig, start if options.start else marked, path.stem, _layout(options))
     if options.start:
         raise ValueError(f"start: {name} is no map of # and .; leave --start out")
     if suffix == ".png":
-        return shaping.image_target(goals.read_image(existing(path)), path.stem, _layout(options), _cells(options))
+        return pipeline.image_target(letters.read_image(existing(path)), path.stem, _layout(options), _cells(options))
     if suffix == ".npy":
-        return shaping.height_target(goals.read_heights(existing(path)), "heights", path.stem, _layout(options, 7.5))
+        return pipeline.height_target(letters.read_heights(existing(path)), "heights", path.stem, _layout(options, 7.5))
     if name == "terrain":
         layout = _layout(options, 7.5)
         land = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
-        return shaping.height_target(land, "terrain", name, layout)
+        return pipeline.height_target(land, "terrain", name, layout)
     raise ValueError(
         f"goal: got {name!r}; give a letter A to Z, a .txt, .png or .npy file, or terrain, "
         "or push any text by its own strokes with --method strokes"
@@ -212,8 +211,7 @@ def _cells(options: argparse.Namespace) -> int:
 
 
 def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | None":
-    from jaxsand.goals import letters as goals
-    from jaxsand.goals import surfaces
+    from jaxsand.goals import letters, surfaces
 
     if options.surface == "level":
         return None
@@ -223,7 +221,7 @@ def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | Non
         return surfaces.terrain_surface(target.scene.grid.shape, options.relief_mm / 1e3)
     if not options.surface.endswith(".npy"):
         raise ValueError(f"surface: got {options.surface!r}; give level, terrain or a .npy file")
-    heights = goals.read_heights(existing(Path(options.surface)))
+    heights = letters.read_heights(existing(Path(options.surface)))
     if heights.shape != target.scene.grid.shape:
         raise ValueError(
             f"surface: got shape {list(heights.shape)}, the scene has {list(target.scene.grid.shape)}; make them equal"

@@ -21,13 +21,13 @@ def run_trench(options: argparse.Namespace) -> None:
     for file in files:
         if file.is_dir():
             raise ValueError(f"out: cannot write {file}, which is a folder; choose another folder")
-    from jaxsand.terramechanics import trench_experiment as rut
+    from jaxsand.terramechanics import trench_experiment
     from jaxsand.terramechanics.scans import read_scans
 
     scans = read_scans(options.measured) if options.measured else {}
-    rut.check_scans(scans)
-    rules = [options.rule] if options.rule else list(rut.RULES)
-    report, profiles = rut.experiment(options.spacing_mm * 1e-3, rules, scans, tell)
+    trench_experiment.check_scans(scans)
+    rules = [options.rule] if options.rule else list(trench_experiment.RULES)
+    report, profiles = trench_experiment.experiment(options.spacing_mm * 1e-3, rules, scans, tell)
     if out:
         from jaxsand.viz.render import save_figure
         from jaxsand.viz.trenches import errors_figure, profiles_figure

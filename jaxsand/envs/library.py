@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsand.envs.multi import LevelGoals, MultiStroke, RoughGoals
 from jaxsand.envs.pushing import Pushing
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.goals.letters import stroke_list
 from jaxsand.goals.surfaces import rough_surface
 from jaxsand.interaction.simulate import check
@@ -125,8 +125,8 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
         if goals.ndim != 3 or not len(goals) or goals.dtype.kind not in "fiub":
             what = f"shape {list(goals.shape)}" if goals.dtype.kind in "fiub" else f"{goals.dtype}"
             raise ValueError(f"goals: got {what}; give one or more maps [G, H, W] in metres")
-        task.fits(scene, goals[0], "goals")
-        task.finite(goals, "goals")
+        metrics.fits(scene, goals[0], "goals")
+        metrics.finite(goals, "goals")
         plans, count = [], len(goals)
     elif isinstance(goals, RandomStrokes):
         plans, count = goals.plans(rng), goals.goals
@@ -159,11 +159,11 @@ def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Ge
 def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray]) -> np.ndarray:
     """The maps [G, H, W] (m) after the strokes of each plan, which are given in the unit square."""
     side = min(scene.grid.shape) * float(scene.grid.spacing) / _GLYPH_MAP
-    low, high = (edge * side for edge in task.GLYPH_SQUARE)
+    low, high = (edge * side for edge in metrics.GLYPH_SQUARE)
     push = _program(env.batching.pushing(env.push, env.settle))
     heights = jnp.asarray(maps)
     for k in range(max(map(len, plans))):
-        strokes = np.stack([task.place(some[min(k, len(some) - 1)], (low, high)) for some in plans]).astype(np.float32)
+        strokes = np.stack([metrics.place(some[min(k, len(some) - 1)], (low, high)) for some in plans]).astype(np.float32)
         after, _ = push(scene, heights, jnp.asarray(strokes))
         due = jnp.array([k < len(some) for some in plans]) & jnp.all(jnp.isfinite(after), axis=(1, 2))
         heights = jnp.where(due[:, None, None], after, heights)

@@ -10,7 +10,7 @@ from jaxsand.envs import episode
 from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.pushing import Batching, ByLength, Push
 from jaxsand.envs.spaces import Box, Dict
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of
@@ -83,7 +83,7 @@ class OnlyDug:
 
     def seen(self, height: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
         """What is dug of the map."""
-        return task.below(height)
+        return metrics.below(height)
 
 
 @jax.tree_util.register_dataclass
@@ -255,7 +255,7 @@ class MultiStroke:
 
     def distance(self, state: StrokeState, params: StrokeParams) -> jax.Array:
         """L: the l2 distance of goal and map in units of the blade's depth (float32)."""
-        far = task.l2(self.measure.seen(state.goal), self.measure.seen(state.height))
+        far = metrics.l2(self.measure.seen(state.goal), self.measure.seen(state.height))
         return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def stroke(self, action: jax.Array, params: StrokeParams) -> jax.Array:

@@ -10,7 +10,7 @@ from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.maps import MapGoals, Walks
 from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.envs.spaces import Box, Dict, Discrete
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.interaction.simulate import act
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.pipeline import Layout
@@ -130,7 +130,7 @@ class OnSand:
 
     def distance(self, state: SandState, params: SandParams) -> jax.Array:
         """L: the l2 distance on what is dug, in units of the blade's depth (float32)."""
-        far = task.l2(self.goal(state.walk, params), task.below(state.height))
+        far = metrics.l2(self.goal(state.walk, params), metrics.below(state.height))
         return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def goal(self, walk: MapState, params: SandParams) -> jax.Array:

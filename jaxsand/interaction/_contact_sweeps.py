@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
-from jaxsand.relaxation import flux_adjoint as adjoint
+from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Around, flows
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
@@ -95,19 +95,19 @@ _SWEEP = Plain(lambda params, _, state: _sweep(*params, *state))
 def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.Array) -> Pulled:
     """The vjp of the sweeps whose surfaces are on the tape, for a cotangent [H, W] of the height after them."""
     sweeps = tape.shape[0]
-    gates = [jnp.minimum(here, there) for here, there in adjoint.pairs(bed, around.open)]
+    gates = [jnp.minimum(here, there) for here, there in flux_adjoint.pairs(bed, around.open)]
     lengths = [length for _, _, length in links(bed.neighbours)]
-    most = adjoint.yields(bed)
+    most = flux_adjoint.yields(bed)
     per_cell = bool(bed.drop.ndim)
 
     def stage(j: jax.Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         gain, excess, tilt, lift, moved = carry
         s = halo(lax.dynamic_index_in_dim(tape, sweeps - 1 - j, keepdims=False))
-        rises = adjoint.steps(bed, s)
-        passed = adjoint.stored(
+        rises = flux_adjoint.steps(bed, s)
+        passed = flux_adjoint.stored(
             [
                 jnp.where(jnp.abs(d) > m, y, 0)
-                for d, m, y in zip(rises, most, adjoint.steps(bed, halo(gain, 0.0)), strict=True)
+                for d, m, y in zip(rises, most, flux_adjoint.steps(bed, halo(gain, 0.0)), strict=True)
             ]
         )
         beyond = [jnp.where(jnp.abs(d) > m, d - jnp.copysign(m, d), 0) for d, m in zip(rises, most, strict=True)]
@@ -118,7 +118,7 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
         else:
             tilt = [tilt[0] + sum(g * x for g, x in zip(gates, signed, strict=True))]
         onward = tuple(g * (y / length) for g, y, length in zip(gates, passed, lengths, strict=True))
-        slope = at(halo(flow.rate * adjoint.gains(bed, onward), 0.0))
+        slope = at(halo(flow.rate * flux_adjoint.gains(bed, onward), 0.0))
         rise = at(s) - around.bottom
         raised = jnp.where(rise > 0, slope, 0)
         return (
@@ -135,16 +135,16 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
     gain, excess, tilt, lift, moved = lax.fori_loop(0, sweeps, stage, carry)
     per_length = [e / length for e, length in zip(excess, lengths, strict=True)]
     if per_cell:
-        drop = adjoint.drop_cotangent(
+        drop = flux_adjoint.drop_cotangent(
             bed, [flow.rate * g / length * t for g, length, t in zip(gates, lengths, tilt, strict=True)]
         )
     else:
-        drop = flow.rate * adjoint.total(tilt[0])
+        drop = flow.rate * flux_adjoint.total(tilt[0])
     return Pulled(
         gain,
-        -flow.rate * at(adjoint.to_less_open(bed, around.open, per_length)),
+        -flow.rate * at(flux_adjoint.to_less_open(bed, around.open, per_length)),
         moved / (1 + around.stretch),
-        -adjoint.to_shape(lift * around.stretch, around.bottom),
-        -adjoint.total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
+        -flux_adjoint.to_shape(lift * around.stretch, around.bottom),
+        -flux_adjoint.total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
         drop,
     )

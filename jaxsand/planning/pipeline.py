@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.interaction.simulate import Shaped, act, check, follow_frames
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.binary import Cell, connected_pieces, plan
@@ -138,8 +138,8 @@ def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -
     rows, columns = dig.shape
     shape = (rows * layout.cell + 2 * layout.margin, columns * layout.cell + 2 * layout.margin)
     scene = make_scene(shape, layout.spacing, tool=layout.blade)
-    goal = task.map_goal(dig, layout.cell, layout.margin, layout.depth)
-    path = task.cell_centre(np.array(found.cells), rows, layout.cell, layout.margin, layout.spacing)
+    goal = metrics.map_goal(dig, layout.cell, layout.margin, layout.depth)
+    path = metrics.cell_centre(np.array(found.cells), rows, layout.cell, layout.margin, layout.spacing)
     path = np.concatenate([path, path[-1:]]) if len(path) == 1 else path
     return Target(name, "map", "plan", scene, goal, (path,), True, layout.depth, found.optimal, found.lower_bound)
 
@@ -154,7 +154,7 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
       ValueError: for a goal that is not finite, smaller than a block, or nowhere deep enough.
     """
     goal = np.asarray(goal, float)
-    task.finite(goal)
+    metrics.finite(goal)
     rows, columns = (n // layout.cell for n in goal.shape)
     if not rows or not columns:
         raise ValueError(
@@ -175,7 +175,7 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
         part = np.zeros_like(dig)
         part[tuple(np.array(sorted(piece)).T)] = True
         found = plan(part, seconds=10)
-        path = task.cell_centre(np.array(found.cells), rows, layout.cell, 0, layout.spacing)
+        path = metrics.cell_centre(np.array(found.cells), rows, layout.cell, 0, layout.spacing)
         paths.append(np.concatenate([path, path[-1:]]) if len(path) == 1 else path)
         optimal, lower = optimal and found.optimal, lower + found.lower_bound
     drawn = bool(np.all(goal <= 0))
@@ -188,8 +188,8 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
     A glyph takes 32 x 32 cells of 0.01 m, and a wider text as many more columns as it needs.
     """
     blade, spacing = Blade(), 0.01
-    placed = task.place(strokes)
-    beyond = max(0.0, placed[:, [0, 2]].max() - task.GLYPH_SQUARE[1])
+    placed = metrics.place(strokes)
+    beyond = max(0.0, placed[:, [0, 2]].max() - metrics.GLYPH_SQUARE[1])
     scene = make_scene((32, 32 + math.ceil(beyond / spacing - 1e-6)), spacing, tool=blade)
     paths = tuple(stroke.reshape(2, 2) for stroke in placed)
     goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, 2)
@@ -206,7 +206,7 @@ def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> 
     """
     scale = cells / max(picture.shape)
     shape = [max(1, round(n * scale)) for n in picture.shape]
-    goal = np.pad(layout.depth * task.resample(picture, (shape[0], shape[1])), layout.margin)
+    goal = np.pad(layout.depth * metrics.resample(picture, (shape[0], shape[1])), layout.margin)
     return height_target(goal, "image", name, layout)
 
 
@@ -255,7 +255,7 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
     """A surface [H, W] (m) after it has settled; level sand at 0 for None."""
     if before is None:
         return np.zeros(scene.grid.shape, np.float32)
-    task.fits(scene, before)
+    metrics.fits(scene, before)
     tell("settling the surface")
     rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
     check(rested)
@@ -266,14 +266,14 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
     """The figures of a result by name; see `ShapeResult`."""
 
     def reduction(view: Callable[[np.ndarray], np.ndarray]) -> float:
-        return float(task.l2_reduction(view(target.goal), view(before.astype(float)), view(after.astype(float))))
+        return float(metrics.l2_reduction(view(target.goal), view(before.astype(float)), view(after.astype(float))))
 
     whole = reduction(lambda h: h)
     return {
-        "iou": float(task.iou(target.goal, after, target.depth)),
+        "iou": float(metrics.iou(target.goal, after, target.depth)),
         "l2_reduction": reduction(lambda h: np.minimum(h, 0)) if target.drawn else whole,
         "l2_reduction_with_berms": whole,
-        "volume_error": task.volume_error(before, after),
+        "volume_error": metrics.volume_error(before, after),
         "max_slope_deg": math.degrees(math.atan(float(steepest_slope(target.scene, after)))),
     }
 

@@ -9,7 +9,7 @@ from jax import lax
 from jax.typing import DTypeLike
 
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
-from jaxsand.relaxation import flux_adjoint as adjoint
+from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, halo
 from jaxsand.relaxation.schemes import Schedule
@@ -51,7 +51,7 @@ class Surges:
         def stage(i: jax.Array, carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
             state, codes = carry
             word = lax.dynamic_index_in_dim(codes, i // 4, keepdims=False)
-            code = adjoint.active(bed, _surface(around, state[0])) << (8 * (i % 4)).astype(jnp.int32)
+            code = flux_adjoint.active(bed, _surface(around, state[0])) << (8 * (i % 4)).astype(jnp.int32)
             codes = lax.dynamic_update_index_in_dim(codes, word | code, i // 4, 0)
             return surge(bed, Flow(rates[i], cut), momenta[i], around, state), codes
 
@@ -67,31 +67,33 @@ class Surges:
             return Plain(self).push(params, k, record, dparams, dstate)
         rates, momenta = self._stages(k, dstate[0].dtype)
         dbed = split(params)[1](dparams)[0]
-        weights = adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
-        dyields = jax.jvp(lambda drop: adjoint.yields(replace(bed, drop=drop)), (bed.drop,), (dbed.drop,))[1]
+        weights = flux_adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
+        dyields = jax.jvp(lambda drop: flux_adjoint.yields(replace(bed, drop=drop)), (bed.drop,), (dbed.drop,))[1]
 
         def stage(i: jax.Array, carry: tuple[jax.Array, Fluxes]) -> tuple[jax.Array, Fluxes]:
             dh, last = carry
             code, moved = _code(record, i), []
             for n, (step, dm, w) in enumerate(
-                zip(adjoint.steps(bed, halo(_ease(around, dh), 0.0)), dyields, weights, strict=True)
+                zip(flux_adjoint.steps(bed, halo(_ease(around, dh), 0.0)), dyields, weights, strict=True)
             ):
-                beyond = jnp.where(adjoint.upward(code, n), step - dm, jnp.where(adjoint.downward(code, n), step + dm, 0))
+                beyond = jnp.where(
+                    flux_adjoint.upward(code, n), step - dm, jnp.where(flux_adjoint.downward(code, n), step + dm, 0)
+                )
                 moved.append(rates[i] * w * beyond + momenta[i] * last[n])
             moved = lax.optimization_barrier(tuple(moved))
-            return dh + adjoint.gains(bed, moved), moved
+            return dh + flux_adjoint.gains(bed, moved), moved
 
-        last = adjoint.to_lattice(bed, dstate[2])
+        last = flux_adjoint.to_lattice(bed, dstate[2])
         dh, last = lax.fori_loop(0, self.interval, stage, (at(dstate[0]), last))
-        return halo(dh, 0.0), None, adjoint.from_lattice(bed, last)
+        return halo(dh, 0.0), None, flux_adjoint.from_lattice(bed, last)
 
     def pull(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
         bed, around, _ = params
         if not _by_links(bed):
             return Plain(self).pull(params, k, record, cotangent)
         rates, momenta = self._stages(k, cotangent[0].dtype)
-        weights = adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
-        lengths = adjoint.opened(bed, None)
+        weights = flux_adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
+        lengths = flux_adjoint.opened(bed, None)
         stretch = weights if bed.drop.ndim else [w / v for w, v in zip(weights, lengths, strict=True)]
 
         def stage(j: jax.Array, carry: Pulled) -> Pulled:
@@ -100,29 +102,29 @@ class Surges:
             again = jnp.where(j > 0, momenta[jnp.minimum(i + 1, self.interval - 1)], 1)
             again, rate = lax.optimization_barrier((again, rates[i]))
             code = _code(record, i)
-            back = [y + again * p for y, p in zip(adjoint.steps(bed, halo(gain, 0.0)), last, strict=True)]
+            back = [y + again * p for y, p in zip(flux_adjoint.steps(bed, halo(gain, 0.0)), last, strict=True)]
             back = lax.optimization_barrier(back)
             onward = [
-                w * jnp.where(adjoint.moving(code, n), y, 0) for n, (w, y) in enumerate(zip(weights, back, strict=True))
+                w * jnp.where(flux_adjoint.moving(code, n), y, 0) for n, (w, y) in enumerate(zip(weights, back, strict=True))
             ]
             signed = [
-                s * jnp.where(adjoint.upward(code, n), y, jnp.where(adjoint.downward(code, n), -y, 0))
+                s * jnp.where(flux_adjoint.upward(code, n), y, jnp.where(flux_adjoint.downward(code, n), -y, 0))
                 for n, (y, s) in enumerate(zip(back, stretch, strict=True))
             ]
             if not bed.drop.ndim:
                 signed = [jnp.asarray(sum(signed))]
             tilt = [t + rate * s for t, s in zip(tilt, signed, strict=True)]
-            return gain + rate * _ease(around, adjoint.gains(bed, tuple(onward))), back, tilt
+            return gain + rate * _ease(around, flux_adjoint.gains(bed, tuple(onward))), back, tilt
 
         gain = at(cotangent[0])
-        last = [-p for p in adjoint.to_lattice(bed, cotangent[2])]
+        last = [-p for p in flux_adjoint.to_lattice(bed, cotangent[2])]
         tilt = [jnp.zeros_like(last[0])] * (len(last) if bed.drop.ndim else 1)
         gain, last, tilt = lax.fori_loop(0, self.interval, stage, (gain, last, tilt))
         last = [momenta[0] * y for y in last]
         dparams = jax.tree.map(jnp.zeros_like, params)
-        drop = adjoint.drop_cotangent(bed, tilt) if bed.drop.ndim else jnp.sum(tilt[0])
+        drop = flux_adjoint.drop_cotangent(bed, tilt) if bed.drop.ndim else jnp.sum(tilt[0])
         floats = split((replace(dparams[0], drop=drop), *dparams[1:]))[0]
-        return floats, (halo(gain, 0.0), None, adjoint.from_lattice(bed, tuple(-p for p in last)))
+        return floats, (halo(gain, 0.0), None, flux_adjoint.from_lattice(bed, tuple(-p for p in last)))
 
     def _stages(self, k: jax.Array, dtype: DTypeLike) -> tuple[jax.Array, jax.Array]:
         """The rate and the momentum of each stage of group k."""

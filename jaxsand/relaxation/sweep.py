@@ -8,7 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Plain, Tree, split
-from jaxsand.relaxation import flux_adjoint as adjoint
+from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
 
@@ -89,8 +89,8 @@ class Sweep(Plain):
         h, gain = at(record[0]), at(cotangent[0])
         s = record[0] if isinstance(around, Nothing) else halo(around.surface(h))
         gate = None if isinstance(around, Nothing) else around.open
-        d, m, weights = adjoint.steps(bed, s), adjoint.yields(bed), adjoint.opened(bed, gate)
-        back = adjoint.steps(bed, halo(gain, 0.0))
+        d, m, weights = flux_adjoint.steps(bed, s), flux_adjoint.yields(bed), flux_adjoint.opened(bed, gate)
+        back = flux_adjoint.steps(bed, halo(gain, 0.0))
         onward, of_yield, of_rate = [], [], []
         for step, most, w, y in zip(d, m, weights, back, strict=True):
             up, down = step > most, step < -most
@@ -99,9 +99,9 @@ class Sweep(Plain):
             of_yield.append(jnp.where(up, pulled, jnp.where(down, -pulled, 0)))
             excess = jnp.where(up, step - most, jnp.where(down, step + most, 0)) * y
             of_rate.append(excess * w)
-        slope = adjoint.gains(bed, lax.optimization_barrier(tuple(onward)))
+        slope = flux_adjoint.gains(bed, lax.optimization_barrier(tuple(onward)))
         dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
-        dbed = replace(dbed, drop=adjoint.drop_cotangent(bed, of_yield))
+        dbed = replace(dbed, drop=flux_adjoint.drop_cotangent(bed, of_yield))
         dflow = replace(dflow, rate=-jnp.sum(sum(of_rate)))
         if isinstance(around, Partial):
             share = at(around.open)

@@ -8,10 +8,10 @@ import numpy as np
 import jaxsand as js
 from jaxsand import envs
 from jaxsand.envs.pushing import Together
-from jaxsand.goals import letters as goals
+from jaxsand.goals import letters
 
 KEY = jax.random.key(0)
-LETTERS = envs.map_pool([goals.letter_map(name)[0] for name in "ALTR"])
+LETTERS = envs.map_pool([letters.letter_map(name)[0] for name in "ALTR"])
 QUICK = js.SteppedPush(1.0, 1)
 SMALL = js.make_scene((16, 16), 0.01, tool=js.Blade())
 LINES = {"line": [[0.1, 0.2, 0.9, 0.3]], "cross": [[0.0, 0.5, 1.0, 0.5], [0.5, 0.0, 0.5, 1.0]]}

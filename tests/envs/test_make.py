@@ -10,8 +10,7 @@ import pytest
 import jaxsand as js
 from jaxsand import envs
 from jaxsand.envs.pushing import ByLength
-from jaxsand.goals import letters as goals
-from jaxsand.goals import metrics as task
+from jaxsand.goals import letters, metrics
 from jaxsand.relaxation.settling import steepest_slope
 
 from ..conftest import MU
@@ -20,12 +19,12 @@ from .cases import KEY, LETTERS, SMALL, one_map, program, small
 
 @pytest.mark.slow
 def test_a_glyphs_own_strokes_make_it():
-    strokes = goals.letter_strokes("T")
+    strokes = letters.letter_strokes("T")
     env, params = js.make("multi-stroke", goals={"T": strokes}, limit=len(strokes))
     _, state = env.reset(KEY, params)
     begun = float(env.distance(state, params))
     step = program(env)
-    for stroke in task.place(strokes):
+    for stroke in metrics.place(strokes):
         action = env.action(stroke, params)
         assert env.stroke(action, params) == pytest.approx(stroke, abs=1e-7)
         _, state, _, terminated, truncated, info = step(KEY, state, action, params)
@@ -34,7 +33,7 @@ def test_a_glyphs_own_strokes_make_it():
     assert float(env.distance(state, params)) < 1e-3 * begun
     whole = np.zeros((32, 32), np.float32)
     scene = js.make_scene((32, 32), 0.01, tool=js.Blade())
-    for stroke in task.place(strokes):
+    for stroke in metrics.place(strokes):
         whole = js.step(scene, whole, stroke).height
     assert np.abs(np.asarray(whole) - np.asarray(params.goals.goals[0])).max() < 1e-6  # as the simulator has it
 

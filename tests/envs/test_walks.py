@@ -8,8 +8,7 @@ import numpy as np
 
 import jaxsand as js
 from jaxsand import envs
-from jaxsand.goals import letters as goals
-from jaxsand.goals import metrics as task
+from jaxsand.goals import letters, metrics
 from jaxsand.planning.binary import make_problem
 
 from .cases import KEY, one_map, program
@@ -17,7 +16,7 @@ from .cases import KEY, one_map, program
 
 def test_the_planners_walk_solves_a_map_in_as_many_steps():
     for name in "AST":
-        dig, _ = goals.letter_map(name)
+        dig, _ = letters.letter_map(name)
         env, params = js.make("single-stroke", goals=one_map(dig), step_cost=1.0)
         plan = js.plan(dig)
         _, state = env.reset(KEY, params)
@@ -35,7 +34,7 @@ def test_the_planners_walk_solves_a_map_in_as_many_steps():
 
 def test_legal_steps_are_the_planners():
     """On every cell of a letter: exactly those to a neighbour that is to be dug."""
-    dig, _ = goals.letter_map("R")
+    dig, _ = letters.letter_map("R")
     env, params = js.make("single-stroke", goals=one_map(dig))
     _, state = env.reset(KEY, params)
     steps = {"N": (-1, 0), "E": (0, 1), "S": (1, 0), "W": (0, -1)}
@@ -77,7 +76,7 @@ def test_random_walks_are_maps_of_one_piece():
 
 
 def test_a_walk_on_sand_ends_with_the_planners_and_digs():
-    dig, _ = goals.letter_map("L")
+    dig, _ = letters.letter_map("L")
     env, params = js.make("single-stroke", on=envs.OnSand(), goals=one_map(dig))
     _, state = env.reset(KEY, params)
     step = program(env)
@@ -86,4 +85,4 @@ def test_a_walk_on_sand_ends_with_the_planners_and_digs():
         assert int(info["outcome"]) == 0
     assert terminated
     lifted = js.settle(params.scene, state.height).height
-    assert float(task.iou(env.goal(state.walk, params), lifted, params.scene.tool.depth)) > 0.85
+    assert float(metrics.iou(env.goal(state.walk, params), lifted, params.scene.tool.depth)) > 0.85

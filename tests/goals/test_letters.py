@@ -6,43 +6,41 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxsand.goals import letters as goals
-from jaxsand.goals import metrics as task
-from jaxsand.goals import surfaces
+from jaxsand.goals import letters, metrics, surfaces
 
 
 def test_letters():
     for letter in string.ascii_uppercase:
-        strokes = goals.letter_strokes(letter)
+        strokes = letters.letter_strokes(letter)
         assert strokes.shape[1] == 4
         assert np.all((strokes >= 0) & (strokes <= 1))
-        dig, start = goals.letter_map(letter)
+        dig, start = letters.letter_map(letter)
         assert dig.shape == (7, 7)
         assert dig[start]
-    assert goals.letter_map("T")[0][0].all()
-    assert len(goals.letter_strokes("A")) == 3
+    assert letters.letter_map("T")[0][0].all()
+    assert len(letters.letter_strokes("A")) == 3
     for letter in ("a", "?", "AB", ""):
         with pytest.raises(ValueError, match="letter: got"):
-            goals.letter_strokes(letter)
+            letters.letter_strokes(letter)
         with pytest.raises(ValueError, match="letter: got"):
-            goals.letter_map(letter)
+            letters.letter_map(letter)
 
 
 def test_text_in_single_strokes():
-    assert np.ptp(goals.text_strokes("LONG")[:, [0, 2]]) > 2
-    assert np.ptp(goals.text_strokes("LONG")[:, [1, 3]]) == pytest.approx(1)
-    strokes = goals.text_strokes("L")
+    assert np.ptp(letters.text_strokes("LONG")[:, [0, 2]]) > 2
+    assert np.ptp(letters.text_strokes("LONG")[:, [1, 3]]) == pytest.approx(1)
+    strokes = letters.text_strokes("L")
     assert np.all((strokes >= -1e-9) & (strokes <= 1 + 1e-9))
     # The foot of the L is its longest level stroke, and lies at the bottom.
     level = strokes[np.abs(strokes[:, 1] - strokes[:, 3]) < 1e-9]
     foot = level[np.argmax(np.abs(level[:, 0] - level[:, 2]))]
     assert foot[1] == pytest.approx(strokes[:, [1, 3]].min())
     with pytest.raises(ValueError, match="text: got ' ', which has no strokes"):
-        goals.text_strokes(" ")
+        letters.text_strokes(" ")
 
 
 def test_text_maps():
-    dig, start = goals.read_text_map("# a comment\n.#\n##\n\nS.\n")
+    dig, start = letters.read_text_map("# a comment\n.#\n##\n\nS.\n")
     assert np.array_equal(dig, [[False, True], [True, True], [True, False]])
     assert start == (2, 0)
     for text, message in (
@@ -53,27 +51,27 @@ def test_text_maps():
         ("SS", "got 2 starts"),
     ):
         with pytest.raises(ValueError, match=f"map: .*{message}"):
-            goals.read_text_map(text)
+            letters.read_text_map(text)
 
 
 def test_pictures(tmp_path):
     grey = np.full((4, 6), 255, np.uint8)
     grey[0, 0] = 0
     Image.fromarray(grey).save(tmp_path / "a.png")
-    read = goals.read_image(tmp_path / "a.png")
+    read = letters.read_image(tmp_path / "a.png")
     assert read.shape == (4, 6)
     assert read[3, 0] == -1  # the top left of the picture is the last row of the map
     assert read.sum() == -1
     Image.fromarray(np.zeros((2, 2, 4), np.uint8)).save(tmp_path / "clear.png")
-    assert np.array_equal(goals.read_image(tmp_path / "clear.png"), np.zeros((2, 2)))
+    assert np.array_equal(letters.read_image(tmp_path / "clear.png"), np.zeros((2, 2)))
     (tmp_path / "b.png").write_text("no picture")
     with pytest.raises(ValueError, match="cannot be read as a picture"):
-        goals.read_image(tmp_path / "b.png")
+        letters.read_image(tmp_path / "b.png")
 
 
 def test_height_files(tmp_path):
     np.save(tmp_path / "h.npy", np.eye(3))
-    assert np.array_equal(goals.read_heights(tmp_path / "h.npy"), np.eye(3))
+    assert np.array_equal(letters.read_heights(tmp_path / "h.npy"), np.eye(3))
     for name, array, message in (
         ("cube", np.zeros((2, 2, 2)), r"got shape \[2, 2, 2\]"),
         ("empty", np.zeros((0, 3)), r"got shape \[0, 3\]"),
@@ -83,10 +81,10 @@ def test_height_files(tmp_path):
     ):
         np.save(tmp_path / f"{name}.npy", array)
         with pytest.raises(ValueError, match=message):
-            goals.read_heights(tmp_path / f"{name}.npy")
+            letters.read_heights(tmp_path / f"{name}.npy")
     (tmp_path / "cut.npy").write_bytes((tmp_path / "h.npy").read_bytes()[:90])
     with pytest.raises(ValueError, match=r"cannot be read as a \.npy array"):
-        goals.read_heights(tmp_path / "cut.npy")
+        letters.read_heights(tmp_path / "cut.npy")
 
 
 def test_terrain():
@@ -98,55 +96,55 @@ def test_terrain():
 def test_resampling_keeps_means_and_planes():
     rng = np.random.default_rng(0)
     image = rng.random((24, 36))
-    small = task.resample(image, (7, 9))
+    small = metrics.resample(image, (7, 9))
     assert small.shape == (7, 9)
     assert small.mean() == pytest.approx(image.mean(), rel=1e-12)
-    assert np.allclose(task.resample(image, (12, 18)), image.reshape(12, 2, 18, 2).mean((1, 3)))
+    assert np.allclose(metrics.resample(image, (12, 18)), image.reshape(12, 2, 18, 2).mean((1, 3)))
     plane = np.arange(10.0)[:, None] + np.zeros(5)
-    large = task.resample(plane, (20, 5))
+    large = metrics.resample(plane, (20, 5))
     assert np.allclose(np.diff(large[1:-1, 0]), 0.5)
-    assert np.array_equal(task.resample(image, (24, 36)), image)
-    assert task.resample(np.ones((1, 1)), (3, 4)).shape == (3, 4)
+    assert np.array_equal(metrics.resample(image, (24, 36)), image)
+    assert metrics.resample(np.ones((1, 1)), (3, 4)).shape == (3, 4)
 
 
 def test_measures():
     goal = np.zeros((4, 4))
     goal[:2] = -0.01
     half = np.where(np.arange(4) < 2, goal, 0.0)
-    assert float(task.iou(goal, goal, 0.01)) == 1
-    assert float(task.iou(goal, half, 0.01)) == 0.5
-    assert float(task.iou(goal * 0, goal * 0, 0.01)) == 1
-    assert float(task.l2_reduction(goal, goal * 0, goal)) == 1
-    assert float(task.l2_reduction(goal, goal * 0, half)) == pytest.approx(1 - np.sqrt(0.5))
-    assert float(task.l2_reduction(goal, goal * 0, goal * 0)) == 0
-    assert float(task.l2_reduction(goal, goal, goal)) == 1
-    assert task.volume_error(goal, goal) == 0
-    assert task.volume_error(goal * 0, goal * 0) == 0
-    assert task.volume_error(goal, half) == pytest.approx(0.5)
+    assert float(metrics.iou(goal, goal, 0.01)) == 1
+    assert float(metrics.iou(goal, half, 0.01)) == 0.5
+    assert float(metrics.iou(goal * 0, goal * 0, 0.01)) == 1
+    assert float(metrics.l2_reduction(goal, goal * 0, goal)) == 1
+    assert float(metrics.l2_reduction(goal, goal * 0, half)) == pytest.approx(1 - np.sqrt(0.5))
+    assert float(metrics.l2_reduction(goal, goal * 0, goal * 0)) == 0
+    assert float(metrics.l2_reduction(goal, goal, goal)) == 1
+    assert metrics.volume_error(goal, goal) == 0
+    assert metrics.volume_error(goal * 0, goal * 0) == 0
+    assert metrics.volume_error(goal, half) == pytest.approx(0.5)
     berms = goal.copy()
     berms[3] = 0.02
-    assert float(task.l2(goal, np.asarray(task.below(berms)))) == 0
-    assert float(task.l2(goal, berms)) == pytest.approx(0.04)
+    assert float(metrics.l2(goal, np.asarray(metrics.below(berms)))) == 0
+    assert float(metrics.l2(goal, berms)) == pytest.approx(0.04)
 
 
 def test_map_goals_are_the_right_way_up():
-    dig, _ = goals.letter_map("L")
-    goal = task.map_goal(dig, cell=3, margin=2, depth=0.01)
+    dig, _ = letters.letter_map("L")
+    goal = metrics.map_goal(dig, cell=3, margin=2, depth=0.01)
     assert goal.shape == (25, 25)
     assert goal[2 + 1, 2 + 3 * 5 + 1] == -0.01  # the foot, at the bottom: low y
     assert goal[-4, 2 + 3 * 5 + 1] == 0
-    centre = task.cell_centre(np.array([(6, 1)]), 7, 3, 2, 0.1)
+    centre = metrics.cell_centre(np.array([(6, 1)]), 7, 3, 2, 0.1)
     assert np.allclose(centre, [[(2 + 4.5) * 0.1, (2 + 1.5) * 0.1]])
-    assert np.allclose(task.place([[0, 0, 1, 1]]), [[0.035, 0.035, 0.285, 0.285]])
+    assert np.allclose(metrics.place([[0, 0, 1, 1]]), [[0.035, 0.035, 0.285, 0.285]])
     with pytest.raises(ValueError, match=r"goal: got shape \[25, 25\], the scene has \[8, 8\]"):
         import jaxsand as js
 
-        task.fits(js.make_scene((8, 8), 0.01), goal)
+        metrics.fits(js.make_scene((8, 8), 0.01), goal)
 
 
 def refusal(path):
     try:
-        assert goals.read_heights(path).ndim == 2
+        assert letters.read_heights(path).ndim == 2
     except ValueError as error:
         return str(error)
 
@@ -164,4 +162,4 @@ def test_spoilt_heights_are_refused_in_one_line(tmp_path):
         assert message is None or (message.startswith(str(bad)) and "\n" not in message)
     bad.write_bytes(b"ncols 3\nnrows 3\n")
     with pytest.raises(ValueError, match=r"cannot be read as a \.npy array \(it does not begin as one\); save one"):
-        goals.read_heights(bad)
+        letters.read_heights(bad)

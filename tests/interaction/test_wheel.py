@@ -10,7 +10,7 @@ import pytest
 
 import jaxsand as js
 from jaxsand.goals.metrics import volume_error
-from jaxsand.interaction import simulate as sim
+from jaxsand.interaction import simulate
 from jaxsand.terramechanics.wheel_trench import Pass, relaxed
 
 from ..conftest import ANGLE, MU, turned
@@ -322,11 +322,11 @@ def test_vmap_and_batches_equal_a_loop(push):
 @both
 def test_other_wheels_and_strokes_need_no_other_program(push):
     rolled(push, level("float32"))
-    before = sim._follow._cache_size()
+    before = simulate._follow._cache_size()
     for sinkage, slip, radius in ((0.01, 0, 0.048), (np.float32(0.02), np.float64(0.3), 1), (jnp.float32(0.02), -1, 0.05)):
         wheel = js.Wheel(radius if radius < 1 else np.float64(0.04), 0.06, sinkage, slip)
         js.step(js.make_scene(SHAPE, DX, 0.4, tool=wheel), level("float32"), [0.1, 0.1, 0.2, 0.3], push=push)
-    assert sim._follow._cache_size() == before
+    assert simulate._follow._cache_size() == before
 
 
 def test_a_window_that_follows_the_wheel():

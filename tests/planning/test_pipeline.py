@@ -5,21 +5,19 @@ import string
 import numpy as np
 import pytest
 
-from jaxsand.goals import letters as goals
-from jaxsand.goals import metrics as task
-from jaxsand.goals import surfaces
+from jaxsand.goals import letters, metrics, surfaces
 from jaxsand.goals.metrics import volume_error
-from jaxsand.planning import pipeline as shaping
+from jaxsand.planning import pipeline
 
 
 def shape(target, before=None):
-    return shaping.shape(target, None if before is None else np.asarray(before))
+    return pipeline.shape(target, None if before is None else np.asarray(before))
 
 
 @pytest.mark.parametrize("letter", "SAQ")
 def test_a_letter_map_is_trenched(letter):
-    dig, start = goals.letter_map(letter)
-    result = shape(shaping.map_target(dig, start, letter, shaping.Layout()))
+    dig, start = letters.letter_map(letter)
+    result = shape(pipeline.map_target(dig, start, letter, pipeline.Layout()))
     assert result.figures["iou"] > 0.84  # a reversal is half a turn, which sweeps: A, with two of them, has 0.849
     assert result.figures["l2_reduction"] > 0.6
     assert result.figures["volume_error"] <= 1e-6
@@ -32,22 +30,22 @@ def test_a_letter_map_is_trenched(letter):
 
 @pytest.mark.parametrize("letter", string.ascii_uppercase)
 def test_every_letter_runs(letter):
-    dig, start = goals.letter_map(letter)
-    result = shape(shaping.map_target(dig, start, letter, shaping.Layout()))
+    dig, start = letters.letter_map(letter)
+    result = shape(pipeline.map_target(dig, start, letter, pipeline.Layout()))
     assert result.figures["iou"] >= 0.7
     assert result.target.optimal
-    own = shape(shaping.glyph_target(goals.letter_strokes(letter), letter))
+    own = shape(pipeline.glyph_target(letters.letter_strokes(letter), letter))
     assert own.figures["iou"] == own.figures["l2_reduction"] == 1
     assert own.figures["volume_error"] <= 1e-6
 
 
 def test_a_glyph_pushed_by_its_own_strokes_is_its_goal():
-    result = shape(shaping.glyph_target(goals.letter_strokes("K"), "K"))
+    result = shape(pipeline.glyph_target(letters.letter_strokes("K"), "K"))
     assert result.figures["iou"] == 1
     assert result.figures["l2_reduction"] == 1
     assert result.lifted
     assert result.steps == 3
-    assert np.allclose(result.strokes, task.place(goals.letter_strokes("K")))
+    assert np.allclose(result.strokes, metrics.place(letters.letter_strokes("K")))
 
 
 @pytest.mark.slow
@@ -55,15 +53,15 @@ def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
     picture = np.zeros((20, 40))
     picture[4:16, 4:10] = -1
     picture[4:16, 28:34] = -1
-    result = shape(shaping.image_target(picture, "two", shaping.Layout(margin=6), 48))
+    result = shape(pipeline.image_target(picture, "two", pipeline.Layout(margin=6), 48))
     assert result.lifted
     assert len(result.target.paths) == 2
     assert result.figures["iou"] > 0.5
 
 
 def test_a_rough_surface_is_settled_first():
-    dig, start = goals.letter_map("L")
-    target = shaping.map_target(dig, start, "L", shaping.Layout())
+    dig, start = letters.letter_map("L")
+    target = pipeline.map_target(dig, start, "L", pipeline.Layout())
     land = surfaces.terrain_surface(target.scene.grid.shape, 0.006)
     assert np.ptp(land) == pytest.approx(0.006)
     result = shape(target, land)
@@ -73,20 +71,20 @@ def test_a_rough_surface_is_settled_first():
 
 
 def test_terrain_as_a_goal():
-    layout = shaping.Layout(depth=0.0075)
-    result = shape(shaping.height_target(surfaces.terrain_surface((48, 48), 0.03), "terrain", "terrain", layout))
+    layout = pipeline.Layout(depth=0.0075)
+    result = shape(pipeline.height_target(surfaces.terrain_surface((48, 48), 0.03), "terrain", "terrain", layout))
     assert not result.target.drawn
     assert result.figures["l2_reduction"] == result.figures["l2_reduction_with_berms"]
     assert result.figures["iou"] > 0.3
 
 
 def test_goals_that_cannot_be_dug():
-    layout = shaping.Layout()
+    layout = pipeline.Layout()
     with pytest.raises(ValueError, match="nothing to dig"):
-        shaping.height_target(np.zeros((12, 12)), "heights", "flat", layout)
+        pipeline.height_target(np.zeros((12, 12)), "heights", "flat", layout)
     with pytest.raises(ValueError, match="fewer than the 6"):
-        shaping.height_target(-np.ones((4, 12)), "heights", "small", layout)
+        pipeline.height_target(-np.ones((4, 12)), "heights", "small", layout)
     with pytest.raises(ValueError, match="1 cells that are not finite"):
         goal = -np.ones((12, 12))
         goal[8, 8] = np.inf
-        shaping.height_target(goal, "heights", "broken", layout)
+        pipeline.height_target(goal, "heights", "broken", layout)

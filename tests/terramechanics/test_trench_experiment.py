@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsand.__main__ import main
-from jaxsand.bench import trenches as rutbench
+from jaxsand.bench import trenches
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.terramechanics import scans
 from jaxsand.terramechanics import trench_experiment as rut
@@ -102,11 +102,11 @@ def test_errors_are_exact_for_known_differences():
 
 @pytest.mark.slow
 def test_error_against_spacing_and_the_papers_case_are_measured():
-    rows = rutbench.against_spacing(spacings=1)
+    rows = trenches.against_spacing(spacings=1)
     pairs = {(row["rule"], row["against"]) for row in rows}
     assert pairs == {(rule, against) for rule in rut.RULES for against in ("closed-form", "exact")}
     assert all(row["mean_abs_mm"] > 0 and row["seconds"] > 0 for row in rows)
-    cases = {(row["name"], row["tolerance"]): row for row in rutbench.settling(turns=1)}
+    cases = {(row["name"], row["tolerance"]): row for row in trenches.settling(turns=1)}
     paper, best = (cases[name, 1e-3] for name in ("paper's sweep, k = dx^2/8", "super-time-stepping"))
     assert best["sweeps"] < paper["sweeps"]
     assert max(best["error"], paper["error"]) < 0.02

@@ -9,7 +9,7 @@ import pytest
 
 from jaxsand.envs.maps import STEPS, map_pool
 from jaxsand.envs.onmap import MapParams, OnMap
-from jaxsand.goals import letters as goals
+from jaxsand.goals import letters
 from train.dqn.learner import Dqn, begin, practise
 from train.dqn.maps import Shapes, among, shape_pool
 from train.dqn.networks import Bins, Greedy, Mean, QNet, around, dueling
@@ -212,7 +212,7 @@ def test_letters_and_maps_set_apart_are_never_drawn():
     assert not among(new.dig, barred).any()
     np.testing.assert_array_equal(new.dig[jnp.array([0, 1, 5])], pool.dig[jnp.array([2, 2, 2])])
     np.testing.assert_array_equal(new.starts[jnp.array([3, 4])], pool.starts[jnp.array([3, 4])])
-    letter = jnp.asarray(goals.letter_map("L")[0])
+    letter = jnp.asarray(letters.letter_map("L")[0])
     assert among(jnp.roll(letter, 1, axis=1)[None], letter[None]).all()
     look = {"goal": jnp.stack([letter, pool.dig[2]])}
     np.testing.assert_array_equal(SingleStroke().barred(look), [True, False])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxsand.bench.stroke_goals import usual_scene
 from jaxsand.envs.library import RandomStrokes
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.goals.layout import right
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.stroke_loss import pushed
@@ -101,5 +101,5 @@ def _goals(count: int, goals: int, seed: int) -> StrokeParams:
     plans = np.stack(RandomStrokes(goals, count, count, _SHORTEST).plans(np.random.default_rng(seed)))
     maps = np.zeros((goals, *scene.grid.shape), np.float32)
     for k in range(count):
-        maps = pushed(scene, maps, task.place(plans[:, k]))
+        maps = pushed(scene, maps, metrics.place(plans[:, k]))
     return StrokeParams(scene, LevelGoals(jnp.asarray(maps[np.isfinite(maps).all((1, 2))])), count)

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxsand.envs.maps import MapPool
 from jaxsand.envs.onmap import MapParams, MapState, OnMap
-from jaxsand.goals import letters as goals
+from jaxsand.goals import letters
 from train.dqn.maps import Shapes, among, shape_pool
 from train.dqn.networks import Greedy, around, flat
 from train.dqn.symmetries import Symmetric
@@ -154,7 +154,7 @@ Task = SingleStroke | Asking
 
 @cache
 def _letters(shape: tuple[int, int]) -> np.ndarray:
-    maps = np.stack([goals.letter_map(letter)[0] for letter in ascii_uppercase])
+    maps = np.stack([letters.letter_map(letter)[0] for letter in ascii_uppercase])
     return maps if maps.shape[1:] == shape else np.zeros((0, *shape), bool)
 
 

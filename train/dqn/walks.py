@@ -19,7 +19,7 @@ from jax import lax
 
 from jaxsand.envs.maps import STEPS, MapPool, map_pool
 from jaxsand.envs.onmap import MapParams, MapState, OnMap
-from jaxsand.goals import letters as goals
+from jaxsand.goals import letters
 from jaxsand.planning.binary import Cell, plan
 from jaxsand.scene.progress import Tell, quiet
 from train.dqn.networks import Greedy, best, of
@@ -54,7 +54,7 @@ def evaluate(
       ValueError: for maps of another shape than the learner's, or as `jaxsand.env.map_pool` does.
     """
     began = time.perf_counter()
-    maps = maps or {letter: goals.letter_map(letter) for letter in ascii_uppercase}
+    maps = maps or {letter: letters.letter_map(letter) for letter in ascii_uppercase}
     env: Any = learner.task.env
     shape = env.shape
     for name, (dig, _) in maps.items():

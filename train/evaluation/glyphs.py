@@ -19,7 +19,7 @@ from jaxsand.bench.stroke_goals import (
     turned_letters,
 )
 from jaxsand.goals import letters as goals
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 from train.imitation.plans import random_plans
@@ -44,7 +44,7 @@ def read_glyphs(path: Path) -> list[StrokeGoal]:
     for name in names:
         if not (name.strip() and name.isprintable()) or names.count(name) > 1:
             raise ValueError(f"glyphs: got the name {name!r:.60}; give each glyph a name of its own that can be printed")
-    return [stroke_goal(name, task.place(goals.stroke_list("glyphs", name, strokes, 0, 1))) for name, strokes in table]
+    return [stroke_goal(name, metrics.place(goals.stroke_list("glyphs", name, strokes, 0, 1))) for name, strokes in table]
 
 
 def _moved(scale: float, shift: float) -> list[StrokeGoal]:
@@ -54,7 +54,7 @@ def _moved(scale: float, shift: float) -> list[StrokeGoal]:
     for name in string.ascii_uppercase:
         angle = rng.uniform(0, 2 * math.pi)
         away = 0.5 + shift * np.array([math.cos(angle), math.sin(angle)] * 2)
-        moved = stroke_goal(name, task.place((goals.letter_strokes(name) - 0.5) * scale + away))
+        moved = stroke_goal(name, metrics.place((goals.letter_strokes(name) - 0.5) * scale + away))
         out.append(replace(moved, size=scale * moved.size))
     return out
 
@@ -62,7 +62,7 @@ def _moved(scale: float, shift: float) -> list[StrokeGoal]:
 def _pushed_by(blade: Blade, degrees: float = 29.0) -> list[StrokeGoal]:
     """Letters pushed by another blade, or in sand of another angle of repose."""
     scene: Scene = make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(degrees), tool=blade)
-    return [stroke_goal(name, task.place(goals.letter_strokes(name)), scene=scene) for name in string.ascii_uppercase]
+    return [stroke_goal(name, metrics.place(goals.letter_strokes(name)), scene=scene) for name in string.ascii_uppercase]
 
 
 def _many() -> list[StrokeGoal]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsand.bench.stroke_goals import StrokeGoal
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.goals.layout import right, strict, strokes_right
 from jaxsand.planning.learned.beam_search import Proposes
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
@@ -47,7 +47,7 @@ def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:
     level = np.zeros_like(goal)
     return {
         "iou": glyph.iou(after),
-        "l2_reduction": float(task.l2_reduction(goal, level, dug)),
+        "l2_reduction": float(metrics.l2_reduction(goal, level, dug)),
         "right": right(goal, dug, glyph.depth),
         "strict": strict(goal, level, dug, glyph.depth),
         "strokes_right": strokes_right(glyph.strokes, pushes, glyph.size),

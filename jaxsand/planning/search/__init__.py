@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from jaxsand.goals import metrics as task
+from jaxsand.goals import metrics
 from jaxsand.planning.search.actions import Actions, Job, Lattice, Path, Steps, longest_stroke
 from jaxsand.planning.search.binary import binary_hints, binary_paths
 from jaxsand.planning.search.reach import blade_size, least_distance
@@ -138,7 +138,7 @@ def _checked(scene: Scene, height: np.ndarray, goal: np.ndarray) -> tuple[np.nda
     blade_size(scene)
     height = np.asarray(fit(scene, as_array("height", np.asarray(height), np.float32))[1])
     goal = np.asarray(goal, float)
-    task.fits(scene, goal)
+    metrics.fits(scene, goal)
     if not np.isfinite(height).all():
         raise ValueError(f"height: got {int(np.sum(~np.isfinite(height)))} cells that are not finite; fill them first")
     slope, mu = float(steepest_slope(scene, height)), np.tan(np.asarray(scene.material.repose_angle, float))

@@ -6,8 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from jaxsand.goals import metrics as task
-from jaxsand.goals import surfaces
+from jaxsand.goals import metrics, surfaces
 from jaxsand.goals.surfaces import rough_surface
 from jaxsand.interaction.simulate import check
 from jaxsand.planning.search.actions import Actions, Lattice, Steps
@@ -94,7 +93,7 @@ def _rough() -> SandTask:
 
 def _terrain() -> SandTask:
     """A patch of real terrain, of 3 cm relief, to be levelled."""
-    land = task.resample(surfaces.terrain()[100:200, 100:200], _SHAPE)
+    land = metrics.resample(surfaces.terrain()[100:200, 100:200], _SHAPE)
     return _levelling("terrain", 0.03 * (land - np.median(land)) / (land.max() - land.min()), 12)
 
 
