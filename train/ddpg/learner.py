@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -186,6 +187,7 @@ def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, j
     ahead = _value(learner, agent.slow_critic, some.after, next_action)
     ahead = jnp.minimum(ahead, learner.task.most(some.after))
     target = some.reward + learner.discount * jnp.where(some.terminated, 0, ahead)
+    chex.assert_equal_shape([some.reward, some.terminated, ahead, target])  # [B]: a [B, 1] would broadcast to [B, B]
 
     def critic_loss(critic: optax.Params) -> jax.Array:
         return jnp.mean((target - _value(learner, critic, some.observation, some.action)) ** 2)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
@@ -147,6 +148,7 @@ class StrokeNet(nn.Module):
 
     def along(self, scores: Scores, strokes: jax.Array) -> Lines:
         """What the second network says of strokes [B, P, 4] (cells), averaged over all views."""
+        chex.assert_shape(strokes, (scores.sight.shape[0], None, 4))
         views, side = scores.sight.shape[1], scores.sight.shape[2]
         every = jnp.stack([turned_strokes(strokes, way, side) for way in range(views)], 1)
         maps = scores.sight[..., -3:-1]
