@@ -18,15 +18,17 @@ from jax.sharding import PartitionSpec as P
 from jaxsand.bench.timing import race
 from jaxsand.envs import LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.interaction.blade_closed_form import SwathPush
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.stroke_loss import pushed
 from jaxsand.relaxation.batching import wide_vectors
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.progress import Tell, quiet
-from jaxsand.scene.window import Whole
+from jaxsand.scene.window import AsNeeded, Whole
 
 Row = dict[str, Any]
 _FULL, _FAST, _MAP, _SAND = KINDS = "full push", "fast push", "walk on a map", "walk on sand"
 _VMAP, _SHARED, _LOOP = "vmap", ", a share to each device", "Gymnasium, one by one"
+_QUICK = {"sub-step 1/4, 2 sweeps": SteppedPush(1 / 4, 2), "sub-step 1/8, 2 sweeps": SteppedPush(1 / 8, 2)}  # see bench push
 _LOOSE = {"0.01 above repose": UntilStill(1e-2), "8 sweeps": Sweeps(8)}  # a push may be settled less well
 _ROUNDS = 3
 _STEPS = 3  # of a batch to a round
@@ -60,7 +62,9 @@ def bench_env(batch: int = 1024, tell: Tell = quiet, kinds: tuple[str, ...] = KI
             scene = replace(params.scene, window=Whole())
             ways.append(_vmapped(kind, "on the whole map", (env, replace(params, scene=scene)), batch))
             ways.append(_vmapped(kind, "not sorted by length", (replace(env, batching=Together()), params), batch))
-            ways.append(_without(kind, scene, batch))
+            ways.append(_without(kind, replace(scene, window=AsNeeded()), batch))
+            for name, push in _QUICK.items():
+                ways += _by_device(kind, name, (replace(env, push=push), params), batch)
         if kind == _FAST:
             env, params = made[kind]
             for name, stop in _LOOSE.items():
