@@ -4,8 +4,8 @@ All maps share one step number, so that the tape for reverse mode can be written
 
 A step whose attribute `trailing` is true computes a batch by itself. `vmap` then moves the batch to the last axis of all
 arrays, the lanes of the vector unit, for the whole loop. On a CPU it takes no more maps at a time than a core's cache holds,
-and runs maps of like `work` together.
-Such a step must not change a map that is done, and its `done` returns one boolean for all maps.
+and runs maps of like `work` together. Such a step must not change a map that is done, and its `done` returns one boolean for
+all maps.
 """
 
 from collections.abc import Callable

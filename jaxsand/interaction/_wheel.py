@@ -32,7 +32,7 @@ _SLIVER = 0.002  # the smallest open share that is divided by: in a narrower one
 _ASIDE = 0.5  # sideways part of the displacement at the rim's two edges, over the part ahead
 _LEAST = 1e-4
 _FOUR = ((0, 1), (0, -1), (1, 0), (-1, 0))
-Shares = tuple[jax.Array, ...]  # of the four straight neighbours, in a halo
+Shares = tuple[jax.Array, ...]  # of the four straight neighbours, with ghost cells
 
 
 @jax.tree_util.register_dataclass

@@ -86,8 +86,8 @@ class SwathPush:
         >>> import jax.numpy as jnp
         >>> import jaxsand as js
         >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
-        >>> shaped = js.step(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]), push=js.SwathPush())
-        >>> bool(shaped.height[4, 4] < 0)
+        >>> pushed = js.act(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]), push=js.SwathPush())
+        >>> bool(pushed.height[4, 4] < 0)
         True
     """
 

@@ -51,8 +51,8 @@ class SplitPush:
         >>> import jax.numpy as jnp
         >>> import jaxsand as js
         >>> scene = js.make_scene((8, 8), 0.01, tool=js.Wheel(radius=0.03, width=0.02, sinkage=0.005))
-        >>> shaped = js.step(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]), push=js.SplitPush())
-        >>> bool(shaped.height[4, 4] < 0)
+        >>> pushed = js.act(scene, jnp.zeros((8, 8)), jnp.array([0.02, 0.04, 0.06, 0.04]), push=js.SplitPush())
+        >>> bool(pushed.height[4, 4] < 0)
         True
     """
 

@@ -1,9 +1,9 @@
-"""How long work says what it is at."""
+"""How long computations report their progress."""
 
 from collections.abc import Callable
 
-Tell = Callable[[str], None]  # is called with what comes next, in a few words
+Tell = Callable[[str], None]  # called with a few words on what comes next
 
 
 def quiet(_: str) -> None:
-    """Tells nobody."""
+    """Reports nothing."""
