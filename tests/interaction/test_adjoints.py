@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.autodiff.while_loop import Plain, repeat, repeat_until
 
 SHAPE = (14, 16)
 RNG = np.random.default_rng(4)
@@ -58,33 +57,3 @@ def test_a_path_of_two_legs(name):
 
     x = (PATH, HEIGHT, angle, 0.0231, 0.0152, 0.0077, 0.12)
     central(loss, tuple(jnp.asarray(v, float) for v in x))
-
-
-@pytest.mark.parametrize("count", [0, 5, 16, 17, 100, 777])
-def test_long_loops_restore_what_the_tape_lost(count):
-    """x <- p x (1 - x), where every step's derivative differs, against the same steps in a scan; lanes of unequal length."""
-
-    def body(p, k, x):
-        return p * x * (1 - x) + 1e-3 * jnp.sin(1.0 * k)
-
-    def scanned(p, x, n):
-        return jax.lax.fori_loop(0, n, lambda k, x: body(p, k, x), x)
-
-    def looped(p, x, n):
-        return repeat_until(lambda q, k, x: k >= q[1], Plain(lambda q, k, x: body(q[0], k, x)), 1000, (p, n), x)[0]
-
-    p, x = jnp.asarray(2.9), jnp.array([0.3, 0.4])
-    ends = jnp.array([count, count // 2])
-    found = jax.jit(jax.vmap(jax.grad(looped, (0, 1)), (None, 0, 0)))(p, x, ends)
-    expected = jax.jit(jax.vmap(lambda x, n: jax.jacfwd(scanned, (0, 1))(p, x, n)))(x, ends)
-    for a, b in zip(found, expected, strict=True):
-        assert np.allclose(a, b, rtol=1e-10, atol=1e-300)
-
-
-def test_a_counted_loop_is_restored_as_well():
-    def looped(p, x):
-        return repeat(Plain(lambda p, k, x: p * jnp.sin(x + k)), 60, p, x)
-
-    x = jnp.array([0.3, 0.4])
-    found = jax.vmap(jax.grad(looped), (None, 0))(1.1, x)
-    assert np.allclose(found, jax.vmap(jax.jacfwd(looped), (None, 0))(1.1, x), rtol=1e-10)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.autodiff.while_loop import Plain, repeat_until
 
 from ..conftest import ANGLE
 
@@ -34,6 +33,7 @@ def point(seed):
     return (rng.uniform(0.03, 0.17, 4), 0.023, 0.0152, 0.0077, 0.5, height)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("seed", range(3))
 def test_a_push_and_its_settling(seed):
     x = tuple(jnp.asarray(v, float) for v in point(seed))
@@ -91,51 +91,6 @@ def test_gradients_under_vmap_and_jit_and_where_nothing_changes():
     assert np.allclose(many, summed, rtol=1e-9, atol=1e-12)
     assert np.array_equal(many[2], np.zeros(4))
     assert np.all(np.isfinite(many[3]))  # no length: finite all the same
-
-
-def test_second_derivatives_are_refused():
-    scene = js.make_scene((8, 8), 0.01, ANGLE)
-    h = jnp.zeros((8, 8)).at[4, 4].set(0.1)
-
-    def f(h, stop):
-        return jnp.sum(js.settle(scene, h, stop=stop).height ** 2)
-
-    for stop in (None, js.Sweeps(4)):
-        for twice in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
-            with pytest.raises(NotImplementedError, match="second derivatives .*are not available"):
-                jax.make_jaxpr(twice(lambda h, stop=stop: f(h, stop)))(h)
-
-
-@pytest.mark.parametrize("bound", [1, 7, 100])
-def test_the_loop_stops_where_told_and_is_differentiated_as_its_steps(bound):
-    """x <- p x + sin(x) / 10 until x > 3, against the same steps written out."""
-
-    def body(p, k, x):
-        return p * x + jnp.sin(x) / 10 + 0.01 * k
-
-    def looped(p, x):
-        return repeat_until(lambda p, k, x: x > 3, Plain(body), bound, p, x)
-
-    p, x = jnp.asarray(1.1), jnp.asarray(0.5)
-    end, count = looped(p, x)
-    assert int(count) == min(bound, 10)
-
-    def unrolled(p, x):
-        for k in range(int(count)):
-            x = body(p, k, x)
-        return x
-
-    assert float(end) == pytest.approx(float(unrolled(p, x)), rel=1e-14)
-    expected = jax.grad(unrolled, (0, 1))(p, x)
-    for got in (
-        jax.grad(lambda p, x: looped(p, x)[0], (0, 1))(p, x),
-        jax.jacfwd(lambda p, x: looped(p, x)[0], (0, 1))(p, x),
-    ):
-        assert np.allclose(got, expected, rtol=1e-12)
-    xs = jnp.array([0.5, 2.9, 3.5])
-    assert np.allclose(
-        jax.vmap(jax.grad(lambda x: looped(p, x)[0]))(xs), [jax.grad(lambda x: looped(p, x)[0])(v) for v in xs], rtol=1e-12
-    )
 
 
 @pytest.mark.slow
