@@ -4,9 +4,11 @@ from typing import Any
 
 
 def as_table(rows: list[dict[str, Any]], title: str) -> list[str]:
-    """Rows of figures as lines of text: what is text in a row names it, and None is a dash."""
-    texts = [" ".join(v for v in row.values() if isinstance(v, str)) for row in rows]
-    names = [n for n in dict.fromkeys(n for row in rows for n in row) if not isinstance(rows[0].get(n), str)]
+    """Rows of figures as lines of text: columns that hold text in any row name the rows, and None is a dash."""
+    columns = list(dict.fromkeys(n for row in rows for n in row))
+    naming = [n for n in columns if any(isinstance(row.get(n), str) for row in rows)]
+    texts = [" ".join(str(row[n]) for n in naming if row.get(n) is not None) for row in rows]
+    names = [n for n in columns if n not in naming]
     first = max(len(title), *map(len, texts)) + 2
     wide = {n: max(10, len(n) + 2) for n in names}
     lines = [title.ljust(first) + "".join(n.replace("_", " ").rjust(wide[n]) for n in names)]
