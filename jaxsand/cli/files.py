@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import Any
 
 
-def existing(path: Path) -> Path:
+def existing(path: Path, accepted: str = "") -> Path:
+    """The path, if there is a file, whose name ends as `accepted` says."""
+    if accepted and path.suffix.lower() != accepted:
+        raise ValueError(
+            f"{path}: {path.suffix or 'no suffix'} is not read; give a {accepted} file: heights [H, W] in metres, first row "
+            "at y = 0, saved with numpy.save (from an .asc or .tif, whose first row is on top: after numpy.flipud)"
+        )
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; give a file")
     if not path.is_file():

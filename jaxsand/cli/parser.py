@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _shape(commands: Any) -> None:
     p = commands.add_parser("shape", help="find the strokes that trench a goal, push them, show what came out")
-    p.add_argument("goal", help="a letter, a .txt map of # and ., a .png (dark is dug), a .npy height map in m, or terrain")
+    p.add_argument("goal", help=_GOAL)
     p.add_argument("--method", choices=["plan", "optimise", "policy", "search", "strokes"], default="plan", help=_METHODS)
     p.add_argument(
         "--strokes",
@@ -70,12 +70,18 @@ def _shape(commands: Any) -> None:
     p.add_argument("--refine", action="store_true", help="policy: improve its plan by gradients")
     p.add_argument("--seed", type=seed, metavar="K", help="for the random choices of optimise and search (0)")
     p.add_argument("--start", metavar="R,C", help="cell where the stroke starts (row 0 on top), or best")
-    p.add_argument("--surface", default="level", help="what lies there before: level, terrain or a .npy file (m)")
+    p.add_argument("--surface", default="level", help="what lies there before: level, terrain or a .npy file, as the goal")
     p.add_argument("--relief-mm", type=number, default=10.0, help="height range of --surface terrain")
-    p.add_argument("--depth-mm", type=number, help="trench depth (3; 7.5 for .npy and terrain)")
+    p.add_argument(
+        "--depth-mm",
+        type=number,
+        help="trench depth (3; 7.5 for .npy and terrain, or as deep as a .npy is by search, optimise and policy)",
+    )
     p.add_argument("--spacing", type=number, help="grid spacing in m (0.01)")
     p.add_argument("--resolution", type=count, help="grid cells to a map cell (6)")
     p.add_argument("--cells", type=count, help="grid cells along the longer side of a .png or terrain (48)")
+    p.add_argument("--first-row", choices=["bottom", "top"], help="where the first row of .npy files lies (bottom: y = 0)")
+    p.add_argument("--no-data", type=number, metavar="V", help=_NO_DATA)
     p.add_argument("--out", type=path_name, metavar="DIR", help="folder to write to (shape-GOAL)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_shape)
@@ -83,13 +89,16 @@ def _shape(commands: Any) -> None:
 
 def _settle(commands: Any) -> None:
     p = commands.add_parser("settle", help="let a height map settle to its angle of repose")
-    p.add_argument("input", type=path_name, metavar="IN.npy", help="height map [H, W] in m")
+    p.add_argument(
+        "input", type=path_name, metavar="IN.npy", help="height map [H, W] in m; OUT.npy has its rows in the same order"
+    )
     p.add_argument("--out-file", type=path_name, required=True, metavar="OUT.npy")
     p.add_argument("--spacing", type=number, default=0.01, metavar="M", help="grid spacing in m (0.01)")
     p.add_argument("--repose-deg", type=number, default=29.0, help="angle of repose (29)")
     p.add_argument("--neighbours", type=neighbours, choices=[4, 8, "isotropic"], default=8, help="4, 8 or isotropic (8)")
     p.add_argument("--scheme", choices=SCHEMES, default="super-time-stepping", help="relaxation: the paper's sweep")
     p.add_argument("--tol", type=number, default=1e-3, help="largest slope in excess of repose, a tangent (1e-3)")
+    p.add_argument("--no-data", type=number, metavar="V", help="cells of this value are solid: -9999, nan, ...")
     p.add_argument("--bound", type=count, default=200_000, help="most sweeps (200000)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_settle)
@@ -115,6 +124,7 @@ def _trench(commands: Any) -> None:
     p.add_argument("--rule", choices=["own", "split"], help="own: the push rule; split: piles as in the closed form (both)")
     columns = "beta_deg, sinkage_mm, scan, x_mm (to the right of the way; the flank that leads is on its left), z_mm"
     p.add_argument("--measured", type=path_name, metavar="CSV", help=f"scans: {columns}")
+    p.add_argument("--no-data", type=number, metavar="V", help="heights of this value in the CSV were not seen: -9999, ...")
     p.add_argument("--out", type=path_name, metavar="DIR", help="folder for the profiles, two figures and the report")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_trench)
@@ -157,6 +167,13 @@ def _bench(commands: Any) -> None:
     p.set_defaults(run=run_benchmark)
 
 
+_GOAL = (
+    "a letter, a .txt map of # and . (first row on top), a .png (dark is dug; first row on top), a .npy height map in m "
+    "(first row at the bottom, y = 0; see --first-row), or terrain"
+)
+_NO_DATA = (
+    "what .npy files hold where nothing is known (-9999, ...); such cells are named and refused, not taken for heights"
+)
 _METHODS = (
     "plan: a shortest path; optimise: strokes by gradients through the sand; policy: what a network learned; "
     "search: strokes tried on real sand; strokes: a glyph's own"

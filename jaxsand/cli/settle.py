@@ -17,7 +17,7 @@ def run_settle(options: argparse.Namespace) -> None:
         raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")
     from jaxsand.goals import letters
 
-    heights = letters.read_heights(existing(options.input))
+    heights = letters.read_heights(existing(options.input, ".npy"))
     import jax
     import numpy as np
 
@@ -30,11 +30,16 @@ def run_settle(options: argparse.Namespace) -> None:
     from jaxsand.relaxation import schemes
     from jaxsand.relaxation.settling import settle
     from jaxsand.relaxation.stopping import Outcome, UntilStill
+    from jaxsand.scene.boundaries import Walls
     from jaxsand.scene.scene import make_scene
 
-    if not np.all(np.isfinite(heights)):
-        raise ValueError(f"{options.input}: got {np.sum(~np.isfinite(heights))} cells that are not finite; fill them first")
-    scene = make_scene(heights.shape, options.spacing, math.radians(options.repose_deg), options.neighbours)
+    solid = np.zeros(heights.shape, bool) if options.no_data is None else letters.same(heights, options.no_data)
+    if bad := int(np.sum(~np.isfinite(heights[~solid]))):
+        raise ValueError(
+            f"{options.input}: got {bad} cells that are not finite; fill them first, or have them solid with --no-data nan"
+        )
+    walls = Walls(jax.numpy.asarray(solid)) if solid.any() else None
+    scene = make_scene(heights.shape, options.spacing, math.radians(options.repose_deg), options.neighbours, walls=walls)
     scheme = getattr(schemes, options.scheme.title().replace("-", ""))()
     stop = UntilStill(options.tol, bound=options.bound)
     folder(options.out_file.parent)
@@ -51,7 +56,7 @@ def run_settle(options: argparse.Namespace) -> None:
     report = {
         "sweeps": int(settled.sweeps),
         "residual": float(settled.residual),
-        "volume_error": volume_error(heights, settled.height),
+        "volume_error": volume_error(*(np.where(solid, 0, h) for h in (heights, settled.height))),
         "outcome": "clean" if not outcome else (outcome.name or str(int(outcome))).lower(),
         "seconds": ran + ready - began,
         "seconds_compile": ready - began,

@@ -28,12 +28,7 @@ def run_shape(options: argparse.Namespace) -> None:
     from jaxsand.viz.render import save_animation, save_figure, shape_figure
 
     began = time.perf_counter()
-    looks = options.method in ("search", "optimise", "policy")
     target = _target(options)
-    if looks and target.drawn:
-        raise ValueError(
-            f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method plan"
-        )
     surface = _surface(options, target)
     out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
     strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
@@ -87,6 +82,10 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
     }
 
 
+_ROWS = "heights in metres, first row at y = 0; with --first-row top, on top as in pictures and maps"
+_OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".json", ".npz", ".svg", ".tif", ".tiff")
+_DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
+
 _BY = {
     "strokes": ("search", "optimise", "policy"),
     "pushes": ("search", "optimise", "policy"),
@@ -102,6 +101,11 @@ def _check_options(options: argparse.Namespace) -> None:
             *others, last = methods
             some = f"{', '.join(others)} or {last}" if others else last
             raise ValueError(f"{option}: has an effect with --method {some} only; leave it out")
+    for option in ("no_data", "first_row"):
+        if getattr(options, option) is not None and ".npy" not in {
+            Path(file).suffix.lower() for file in (options.goal, options.surface)
+        }:
+            raise ValueError(f"{option.replace('_', '-')}: has an effect on .npy files only; leave it out")
     if options.method == "policy" and options.pushes and not options.refine:
         raise ValueError("pushes: has an effect on the policy with --refine only; add that, or leave it out")
 
@@ -149,7 +153,7 @@ def _summary(report: dict[str, Any]) -> str:
 
 
 def _target(options: argparse.Namespace) -> "Target":
-    from jaxsand.goals import letters, surfaces
+    from jaxsand.goals import letters
     from jaxsand.planning import pipeline
 
     name, method = options.goal, options.method
@@ -158,6 +162,8 @@ def _target(options: argparse.Namespace) -> "Target":
     is_file = suffix in (".txt", ".png", ".npy")
     if not name.strip():
         raise ValueError("goal: got an empty name; give a letter, a .txt, .png or .npy file, or terrain")
+    if suffix and not is_file and (suffix in _OTHER_FILES or path.is_file()):
+        raise ValueError(f"goal: got {name!r}, and {suffix} is not read; give a .txt, .png or .npy file ({_ROWS})")
     if method == "strokes" and (is_file or name == "terrain"):
         raise ValueError(f"method: 'strokes' pushes a glyph's own strokes, {name} has none; use --method plan")
     if method != "plan" and not (is_file or name == "terrain"):
@@ -166,27 +172,66 @@ def _target(options: argparse.Namespace) -> "Target":
                 raise ValueError(f"{option.replace('_', '-')}: has no effect on a glyph's own strokes; leave it out")
         letter = name.upper() if len(name) == 1 and name.isascii() and name.isalpha() else ""
         return pipeline.glyph_target(letters.letter_strokes(letter) if letter else letters.text_strokes(name), name)
+    if (is_file and suffix != ".txt") or name == "terrain":
+        return _surface_target(options)
+    if method != "plan":
+        raise _drawn(options)
     start = read_cell(options.start)
-    if len(name) == 1:
+    if is_file:
+        dig, own = letters.read_text_map(read_text(path), str(path))
+    elif len(name) == 1:
         dig, own = letters.letter_map(name.upper() if name.isascii() else name)
-        return pipeline.map_target(dig, start if options.start else own, name.upper(), _layout(options))
-    if suffix == ".txt":
-        dig, marked = letters.read_text_map(read_text(path), str(path))
-        return pipeline.map_target(dig, start if options.start else marked, path.stem, _layout(options))
+    else:
+        raise ValueError(
+            f"goal: got {name!r}; give a letter A to Z, a .txt, .png or .npy file, or terrain, "
+            "or push any text by its own strokes with --method strokes"
+        )
+    return pipeline.map_target(
+        dig, start if options.start else own, path.stem if is_file else name.upper(), _layout(options)
+    )
+
+
+def _surface_target(options: argparse.Namespace) -> "Target":
+    """The goal that a picture, a height map or the terrain is; with strokes only where the method is to plan them."""
+    from jaxsand.goals import letters, surfaces
+    from jaxsand.planning import pipeline
+
+    name, path, planned = options.goal, Path(options.goal), options.method == "plan"
     if options.start:
         raise ValueError(f"start: {name} is no map of # and .; leave --start out")
-    if suffix == ".png":
-        return pipeline.image_target(letters.read_image(existing(path)), path.stem, _layout(options), _cells(options))
-    if suffix == ".npy":
-        return pipeline.height_target(letters.read_heights(existing(path)), "heights", path.stem, _layout(options, 7.5))
+    if path.suffix.lower() == ".png":
+        picture = letters.read_image(existing(path))
+        if not planned:
+            raise _drawn(options)
+        return pipeline.image_target(picture, path.stem, _layout(options), _cells(options))
     if name == "terrain":
-        layout = _layout(options, 7.5)
-        land = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
-        return pipeline.height_target(land, "terrain", name, layout)
-    raise ValueError(
-        f"goal: got {name!r}; give a letter A to Z, a .txt, .png or .npy file, or terrain, "
-        "or push any text by its own strokes with --method strokes"
-    )
+        layout = _layout(options, _DEEP)
+        heights = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
+    else:
+        heights = _heights(path, "goal", options)
+        layout = _layout(options, _DEEP if planned else _deep_enough(heights, options.method))
+    make = pipeline.height_target if planned else pipeline.height_goal
+    return make(heights, "terrain" if name == "terrain" else "heights", path.stem, layout)
+
+
+def _heights(path: Path, field: str, options: argparse.Namespace) -> "np.ndarray":
+    """A height map without gaps, first row at y = 0."""
+    from jaxsand.goals.letters import read_heights
+    from jaxsand.goals.metrics import finite
+
+    heights = read_heights(existing(path), options.no_data)
+    finite(heights, field)
+    return heights[::-1] if options.first_row == "top" else heights
+
+
+def _drawn(options: argparse.Namespace) -> ValueError:
+    return ValueError(f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method plan")
+
+
+def _deep_enough(heights: "np.ndarray", method: str) -> float:
+    """The depth (mm) of a blade that digs a goal and no deeper: one that only levels and heaps scrapes at height 0."""
+    depth = 1e3 * max(0.0, -float(heights.min()))
+    return _DEEP if method == "policy" and not depth else min(depth, _DEEP)
 
 
 def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
@@ -195,7 +240,8 @@ def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
     depth = depth_mm if options.depth_mm is None else options.depth_mm
     spacing = 0.01 if options.spacing is None else options.spacing
     resolution = options.resolution or 6
-    for field, value in (("spacing", spacing), ("depth-mm", depth)):
+    scrapes = options.method in ("search", "optimise") and depth == 0
+    for field, value in (("spacing", spacing), *(() if scrapes else (("depth-mm", depth),))):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{field}: got {value}; give a positive number")
     for field, value, most in (("resolution", resolution, 64), ("cells", _cells(options), 1024)):
@@ -211,7 +257,7 @@ def _cells(options: argparse.Namespace) -> int:
 
 
 def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | None":
-    from jaxsand.goals import letters, surfaces
+    from jaxsand.goals import surfaces
 
     if options.surface == "level":
         return None
@@ -219,9 +265,10 @@ def _surface(options: argparse.Namespace, target: "Target") -> "np.ndarray | Non
         if not (math.isfinite(options.relief_mm) and options.relief_mm >= 0):
             raise ValueError(f"relief-mm: got {options.relief_mm}; give the terrain's height range, 0 or more")
         return surfaces.terrain_surface(target.scene.grid.shape, options.relief_mm / 1e3)
-    if not options.surface.endswith(".npy"):
-        raise ValueError(f"surface: got {options.surface!r}; give level, terrain or a .npy file")
-    heights = letters.read_heights(existing(Path(options.surface)))
+    path = Path(options.surface)
+    if path.suffix.lower() != ".npy":
+        raise ValueError(f"surface: got {options.surface!r}; give level, terrain or a .npy file ({_ROWS})")
+    heights = _heights(path, "surface", options)
     if heights.shape != target.scene.grid.shape:
         raise ValueError(
             f"surface: got shape {list(heights.shape)}, the scene has {list(target.scene.grid.shape)}; make them equal"

@@ -24,7 +24,9 @@ def run_trench(options: argparse.Namespace) -> None:
     from jaxsand.terramechanics import trench_experiment
     from jaxsand.terramechanics.scans import read_scans
 
-    scans = read_scans(options.measured) if options.measured else {}
+    if options.no_data is not None and not options.measured:
+        raise ValueError("no-data: has an effect on --measured only; leave it out")
+    scans = read_scans(options.measured, options.no_data) if options.measured else {}
     trench_experiment.check_scans(scans)
     rules = [options.rule] if options.rule else list(trench_experiment.RULES)
     report, profiles = trench_experiment.experiment(options.spacing_mm * 1e-3, rules, scans, tell)

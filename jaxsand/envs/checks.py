@@ -1,8 +1,10 @@
 """Checks of what `make` is given, before anything is computed from it."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, get_args
 
+import jax
 import numpy as np
 
 from jaxsand.envs.maps import MapGoals
@@ -10,6 +12,7 @@ from jaxsand.envs.multi import LevelGoals, NoStop, OnlyDug, RoughGoals, Stop, Wi
 from jaxsand.envs.onmap import OnMap
 from jaxsand.envs.onsand import OnSand
 from jaxsand.envs.pushing import Batching, Push
+from jaxsand.goals.metrics import finite
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.validation import concrete
@@ -50,8 +53,14 @@ def check_scene(scene: object) -> None:
 
 
 def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: object) -> None:
-    """Raises ValueError for goals that are not of the scene's shape, or with `starts` beside goals that have their own."""
+    """Raises ValueError for goals that are not of the scene's shape or not finite, or with `starts` beside goals that have
+    their own.
+    """
     if goals.goals.shape[-2:] != scene.grid.shape:
         raise ValueError(f"goals: got maps of {list(goals.goals.shape[-2:])}, the scene has {list(scene.grid.shape)} cells")
+    for field in fields(goals):
+        maps = getattr(goals, field.name)
+        if not isinstance(maps, jax.core.Tracer):
+            finite(maps, field.name)
     if starts is not None:
         raise ValueError(f"starts: got {starts!r} beside goals that are ready; leave it out, or give strokes as goals")

@@ -22,6 +22,7 @@ import gymnasium
 import jax
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -45,6 +46,26 @@ def _refuse_forks() -> None:
             "vectorization_mode: got processes that were forked, in which JAX does not run; give make_vec "
             'vector_kwargs={"context": "spawn"}, or vectorization_mode="vector_entry_point", which is one program and faster'
         )
+
+
+def _begun(state: Any, what: str) -> None:
+    """Raises ResetNeeded before the first reset."""
+    if state is None:
+        raise ResetNeeded(f"cannot {what} before the first reset; call reset()")
+
+
+def _no_other(options: dict[str, Any] | None, *known: str) -> None:
+    """Raises ValueError for an option of `reset` that there is not."""
+    if options:
+        have = f"give {', '.join(known)}" if known else "it has none"
+        raise ValueError(
+            f"options: got {', '.join(map(repr, options))}, no option of reset; {have}, or make another environment"
+        )
+
+
+def _chosen(which: np.ndarray, new: Any, old: Any) -> Any:
+    """The new array where an environment begins anew, else the old one."""
+    return jax.numpy.where(which.reshape(-1, *[1] * (np.ndim(new) - 1)), new, old)
 
 
 def _known(space: spaces.Space[Any], actions: ArrayLike, shape: tuple[int, ...]) -> None:
@@ -77,12 +98,14 @@ class _Sand(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begins an episode; returns its first observation and the info."""
         super().reset(seed=seed, options=options)
+        _no_other(options)
         obs, self.state, about = _alone(self.core)[0](_key(self.np_random), self.params)
         self.shown = _arrays(obs)
         return _view(self.shown), _arrays(about)
 
     def step(self, action: ArrayLike) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         """Takes one action; returns observation, reward, terminated, truncated and info."""
+        _begun(self.state, "step")
         _known(self.action_space, action, self.action_space.shape or ())
         # No environment draws anything in a step: any key will do.
         out = _alone(self.core)[1](jax.random.key(0), self.state, np.asarray(action), self.params)
@@ -94,6 +117,7 @@ class _Sand(gymnasium.Env):
         """A picture of goal and sand side by side, [height, width, 3] (uint8); None unless render_mode is "rgb_array"."""
         if self.render_mode is None:
             return None
+        _begun(self.state, "render")
         return picture(self.core, self.shown)
 
 
@@ -148,7 +172,7 @@ class MultiStrokeEnv(_Sand):
 
     def step(self, action: ArrayLike) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         """Pushes once; returns observation, reward, terminated, truncated and info."""
-        previous = self.shown["current"]
+        previous = self.shown.get("current")
         obs, _, terminated, truncated, info = super().step(action)
         info["previous"] = previous
         reward = float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], info))
@@ -158,7 +182,7 @@ class MultiStrokeEnv(_Sand):
         """The reward of a push for any goal, exactly as `step` computes it for the goal that was given.
 
         Args:
-          achieved_goal: the map after the push, [H, W], or [B, H, W] for many.
+          achieved_goal: the map after the push, [H, W], or [B, H, W] for many; maps may be flattened.
           desired_goal: the goal, of the same shape.
           info: the info of the push, or B infos; info["previous"] is the map before the push.
 
@@ -166,20 +190,35 @@ class MultiStrokeEnv(_Sand):
           A number, or [B] for many.
 
         Raises:
-          ValueError: if an info does not hold the map before the push.
+          ValueError: for goals that are no such maps, or an info that does not hold the map before the push.
         """
-        single = np.ndim(achieved_goal) == 2
+        single = isinstance(info, dict)
         infos: list[Any] = [info] if single else list(info)
         if not all("previous" in one for one in infos):
             raise ValueError(
                 "info: got one without 'previous', the map before the push; keep the infos of `step` "
                 "(Stable-Baselines3: replay_buffer_kwargs={'copy_info_dict': True})"
             )
-        before = np.stack([one["previous"] for one in infos])
-        goal = np.asarray(desired_goal).reshape(before.shape)
-        after = np.asarray(achieved_goal).reshape(before.shape)
+        before, goal, after = (
+            self._maps(name, maps, len(infos))
+            for name, maps in (
+                ("info", np.array([one["previous"] for one in infos])),
+                ("desired_goal", desired_goal),
+                ("achieved_goal", achieved_goal),
+            )
+        )
         reward = self._distance(goal, before) - self._distance(goal, after)
         return reward[0] if single else reward
+
+    def _maps(self, name: str, maps: Any, count: int) -> np.ndarray:
+        rows, columns = self.params.scene.grid.shape
+        given = np.asarray(maps)
+        if given.size != count * rows * columns:
+            raise ValueError(
+                f"{name}: got shape {list(given.shape)} for {count} infos; give [{rows}, {columns}] with one info, or "
+                f"[B, {rows}, {columns}] with a list of B infos (each map may be flattened)"
+            )
+        return given.reshape(count, rows, columns)
 
     def _distance(self, goal: np.ndarray, maps: np.ndarray) -> np.ndarray:
         seen = self.core.measure.seen
@@ -217,16 +256,54 @@ class SandVectorEnv(VectorEnv):
         self.state: Any = None
         self.shown: Obs = {}
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begins an episode in each; with a seed, the i-th begins as a single environment with `seed` + i does."""
-        super().reset(seed=seed, options=options)
-        own = [self.np_random if seed is None else np_random(seed + i)[0] for i in range(self.num_envs)]
-        obs, self.state, about = _together(self.core)[0](jax.numpy.stack([_key(one) for one in own]), self.params)
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Obs, dict[str, Any]]:
+        """Begins an episode in each; with a seed, the i-th begins as a single environment with `seed` + i does. A list holds
+        a seed for each.
+
+        Where options["reset_mask"] (booleans [num_envs]) is false an environment goes on as it was.
+        """
+        seeds = self._seeds(seed)
+        which = self._which(options)
+        first = next((one for one in seeds if one is not None), None)
+        if which.all():
+            super().reset(seed=first)
+        own = [self.np_random if one is None else np_random(one)[0] for one in seeds]
+        begun = _together(self.core)[0](jax.numpy.stack([_key(one) for one in own]), self.params)
+        if not which.all():
+            obs, state, about = begun
+            kept = jax.tree.map(partial(_chosen, which), (obs, state), (self.shown, self.state))
+            begun = (*kept, {name: _chosen(which, x, np.zeros_like(x)) for name, x in about.items()})
+        obs, self.state, about = begun
         self.shown = _arrays(obs)
-        return _view(self.shown), _masked(_arrays(about), np.ones(self.num_envs, bool))
+        return _view(self.shown), _masked(_arrays(about), which)
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        if seed is None or isinstance(seed, int | np.integer):
+            return [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: got {len(seeds)} for {self.num_envs} environments; give one for each, or one number")
+        return [None if one is None else int(one) for one in seeds]
+
+    def _which(self, options: dict[str, Any] | None) -> np.ndarray:
+        """Which environments a reset begins anew."""
+        rest = dict(options or {})
+        which = np.asarray(rest.pop("reset_mask", np.ones(self.num_envs, bool)))
+        _no_other(rest, "reset_mask")
+        if which.dtype != bool or which.shape != (self.num_envs,) or not which.any():
+            raise ValueError(
+                f"reset_mask: got {which.dtype} of shape {list(which.shape)}, {int(np.sum(which))} of them true; "
+                f"give {self.num_envs} booleans, one or more of them true"
+            )
+        if not which.all():
+            _begun(self.state, "reset a part of the environments")
+        return which
 
     def step(self, actions: ArrayLike) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Takes one action in each, and begins a new episode where one ended."""
+        _begun(self.state, "step")
         _known(self.single_action_space, actions, self.action_space.shape or ())
         keys = jax.random.split(_key(self.np_random), self.num_envs)
         out = _together(self.core)[1](keys, self.state, np.asarray(actions), self.params)
@@ -253,6 +330,7 @@ class SandVectorEnv(VectorEnv):
         """A picture of each environment; None unless render_mode is "rgb_array"."""
         if self.render_mode is None:
             return None
+        _begun(self.state, "render")
         return tuple(picture(self.core, {name: x[i] for name, x in self.shown.items()}) for i in range(self.num_envs))
 
 

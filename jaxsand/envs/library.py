@@ -17,6 +17,7 @@ from jaxsand.goals.surfaces import rough_surface
 from jaxsand.interaction.simulate import check
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene
 
 _TRIES = 16
@@ -118,15 +119,15 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
     """
     if not isinstance(starts, Level | Rough):
         raise ValueError(f"starts: got {starts!r}; give Level() or Rough()")
-    if isinstance(goals, jax.Array):
-        goals = np.asarray(goals)
+    if isinstance(goals, np.ndarray | jax.Array):
+        goals = np.asarray(gaps(goals))
     rng = np.random.default_rng(seed)
     if isinstance(goals, np.ndarray):
         if goals.ndim != 3 or not len(goals) or goals.dtype.kind not in "fiub":
             what = f"shape {list(goals.shape)}" if goals.dtype.kind in "fiub" else f"{goals.dtype}"
             raise ValueError(f"goals: got {what}; give one or more maps [G, H, W] in metres")
-        metrics.fits(scene, goals[0], "goals")
         metrics.finite(goals, "goals")
+        metrics.fits(scene, goals[0], "goals")
         plans, count = [], len(goals)
     elif isinstance(goals, RandomStrokes):
         plans, count = goals.plans(rng), goals.goals

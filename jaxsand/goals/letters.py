@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxsand.scene.masked import gaps, unmasked
+
 Cell = tuple[int, int]
 
 
@@ -27,6 +29,7 @@ def stroke_list(field: str, name: object, strokes: object, low: float = -math.in
       ValueError: names the field, the glyph and the stroke, unless there is at least one stroke, all of finite numbers from
         `low` to `high`.
     """
+    strokes = unmasked(field, strokes)
     try:
         found = np.array(strokes)
     except (TypeError, ValueError, OverflowError):
@@ -81,13 +84,22 @@ def read_text_map(text: str, name: str = "map") -> tuple[np.ndarray, Cell | None
 
 
 def read_image(path: str | Path) -> np.ndarray:
-    """Reads a picture as a map from 0 (white) to -1 (black), row 0 at the bottom; transparency counts as white."""
+    """Reads a picture as a map from 0 (white) to -1 (black), row 0 at the bottom; what is transparent counts as white.
+
+    Grey of 16 bits keeps them; numbers in other files than PNG, such as a TIFF's floats, are no shades and refused.
+    """
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as image:
-            if image.mode.startswith("I"):  # 16 bits: a height map's usual depth
-                return np.flipud(np.asarray(image, float) / 65535 - 1)
+            if image.mode.startswith(("I", "F")):
+                if image.format != "PNG":
+                    raise ValueError(
+                        f"{path}: got a {image.format} of numbers (mode {image.mode}), which have no white or black; "
+                        "give a PNG, or save heights in metres with numpy.save as .npy"
+                    )
+                grey = np.asarray(image, float)  # 16 bits: a height map's usual depth
+                return np.flipud(np.where(grey == image.info.get("transparency"), 0, grey / 65535 - 1))
             flat = Image.new("RGBA", image.size, "white")
             flat.alpha_composite(image.convert("RGBA"))
     except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, OSError) as error:
@@ -96,8 +108,11 @@ def read_image(path: str | Path) -> np.ndarray:
     return np.flipud(grey / 255 - 1)
 
 
-def read_heights(path: str | Path) -> np.ndarray:
-    """Reads a height map [H, W] (m) from a .npy file; its row 0 is at y = 0, where a picture's row 0 is on top."""
+def read_heights(path: str | Path, no_data: float | None = None) -> np.ndarray:
+    """Reads a height map [H, W] (m) from a .npy file; its row 0 is at y = 0, where a picture's row 0 is on top.
+
+    Cells that hold the value `no_data` become NaN.
+    """
     try:
         with Path(path).open("rb") as file:
             if file.read(6) != b"\x93NUMPY":
@@ -113,7 +128,8 @@ def read_heights(path: str | Path) -> np.ndarray:
         raise ValueError(f"{path}: got dtype {heights.dtype}; give heights in metres as floats")
     if heights.dtype.itemsize > 8:
         raise ValueError(f"{path}: got dtype {heights.dtype}; save float32 or float64")
-    return heights.astype(heights.dtype.newbyteorder("="))
+    heights = heights.astype(heights.dtype.newbyteorder("="))
+    return heights if no_data is None else gaps(np.ma.masked_array(heights, same(heights, no_data)))
 
 
 def text_strokes(text: str) -> np.ndarray:
@@ -159,6 +175,14 @@ def _map_letters() -> dict[str, tuple[np.ndarray, Cell]]:
 
 def _data(name: str) -> str:
     return resources.files("jaxsand").joinpath("data", name).read_text(encoding="utf-8")
+
+
+def same(heights: np.ndarray, value: float) -> np.ndarray:
+    """Which heights are a value, as far as their dtype can tell."""
+    if math.isnan(value):
+        return np.isnan(heights)
+    with np.errstate(over="ignore"):
+        return heights == (heights.dtype.type(value) if heights.dtype.kind == "f" else value)
 
 
 def _reason(error: BaseException) -> str:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.scene.masked import gaps, unmasked
 from jaxsand.scene.scene import Scene
 
 _Map = jax.Array | np.ndarray
@@ -139,7 +140,7 @@ def volume_error(before: jax.typing.ArrayLike, after: jax.typing.ArrayLike) -> f
       >>> js.task.volume_error([[0.0, 0.0]], [[0.5, -0.25]])
       0.3333333333333333
     """
-    h0, h1 = np.asarray(before, np.float64), np.asarray(after, np.float64)
+    h0, h1 = (np.asarray(unmasked(name, h), np.float64) for name, h in (("before", before), ("after", after)))
     moved = max(math.fsum(np.abs(h0).ravel()), math.fsum(np.abs(h1 - h0).ravel()))
     return abs(math.fsum([*h1.ravel(), *-h0.ravel()])) / moved if moved else 0.0
 
@@ -224,12 +225,16 @@ def resample(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     Returns:
       The new map, of `shape`.
 
+    Raises:
+      ValueError: if a cell is not finite or masked; what is missing would spread.
+
     Example:
       >>> import numpy as np
       >>> import jaxsand as js
       >>> js.task.resample(np.array([[0.0, 2.0], [4.0, 6.0]]), (1, 1)).tolist()
       [[3.0]]
     """
+    finite(image, "image")
     for axis in (0, 1):
         image = np.moveaxis(_resample_rows(np.moveaxis(image, axis, 0), shape[axis]), 0, axis)
     return image
@@ -281,7 +286,7 @@ def fits(scene: Scene, goal: np.ndarray, name: str = "goal") -> None:
 
 
 def finite(goal: np.ndarray, name: str = "goal") -> None:
-    """Checks that every cell of a goal is finite.
+    """Checks that every cell of a goal is finite and none is masked.
 
     Args:
       goal: [H, W] (m).
@@ -291,7 +296,7 @@ def finite(goal: np.ndarray, name: str = "goal") -> None:
       None.
 
     Raises:
-      ValueError: if a cell is not finite; it says how many.
+      ValueError: if a cell is not finite or masked; it says how many.
 
     Example:
       >>> import numpy as np
@@ -299,7 +304,9 @@ def finite(goal: np.ndarray, name: str = "goal") -> None:
       >>> js.task.finite(np.array([[np.nan]]))
       Traceback (most recent call last):
         ...
-      ValueError: goal: got 1 cells that are not finite; fill them first
+      ValueError: goal: got 1 cells that are not finite; fill them first, such as with the height of the sand around
     """
-    if not np.all(np.isfinite(goal)):
-        raise ValueError(f"{name}: got {int(np.sum(~np.isfinite(goal)))} cells that are not finite; fill them first")
+    if bad := int(np.sum(~np.isfinite(gaps(goal)))):
+        raise ValueError(
+            f"{name}: got {bad} cells that are not finite; fill them first, such as with the height of the sand around"
+        )

@@ -18,7 +18,7 @@ def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: in
     """The target with at most `strokes` strokes from a search on real sand, which costs about `pushes` pushes (see
     `plan_sand`).
 
-    The distance counts all sand, berms too, even where the goal was drawn without berms.
+    The distance counts all sand, berms too, even where the goal is nowhere above height 0.
     """
     start = at_rest(target.scene, before, tell)
     tell(f"searching {strokes} strokes in about {pushes} pushes")
@@ -42,5 +42,5 @@ def by_policy(target: Target, before: np.ndarray | None, strokes: int, stages: S
 
 
 def _by(method: str, target: Target, found: SandPlan | Optimised | Planned, paths: Iterable[np.ndarray]) -> Target:
-    """The target with the paths that a method found."""
-    return replace(target, method=method, paths=tuple(paths), optimal=None, lower_bound=None, found=found)
+    """The target with the paths that a method found, compared as they were sought: with berms."""
+    return replace(target, method=method, paths=tuple(paths), drawn=False, optimal=None, lower_bound=None, found=found)

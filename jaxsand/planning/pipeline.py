@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.goals import metrics
-from jaxsand.interaction.simulate import Shaped, act, check, follow_frames
-from jaxsand.interaction.stepped import SteppedPush
+from jaxsand.interaction.simulate import Shaped, check, follow_frames
 from jaxsand.planning.binary import Cell, connected_pieces, plan
 from jaxsand.planning.gradient import Optimised
 from jaxsand.planning.learned.stages import Planned
@@ -25,6 +24,9 @@ from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Whole
+
+_PARTS = 6  # of a single stroke, in its recording
+_KEPT = 2**28  # bytes of a recording's maps: more legs than that are recorded less often
 
 Kind = Literal["map", "glyph", "image", "heights", "terrain"]
 
@@ -144,42 +146,48 @@ def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -
     return Target(name, "map", "plan", scene, goal, (path,), True, layout.depth, found.optimal, found.lower_bound)
 
 
+def height_goal(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
+    """A height map as a goal that has no strokes yet."""
+    metrics.finite(goal)
+    goal = np.asarray(goal, float)
+    scene = make_scene(goal.shape, layout.spacing, tool=layout.blade)
+    return Target(name, kind, "plan", scene, goal, (), bool(np.all(goal <= 0)), layout.depth)
+
+
 def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
     """The shortest single stroke over each connected piece of a height map [H, W] (m) that is deeper than half the trench
     depth.
 
-    The map is divided into blocks of `layout.cell` grid cells a side, and a block is dug where its mean is deep enough.
+    The map is divided into blocks of about `layout.cell` grid cells a side, none wider than the blade, and a block is dug
+    where its mean is deep enough.
 
     Raises:
       ValueError: for a goal that is not finite, smaller than a block, or nowhere deep enough.
     """
-    goal = np.asarray(goal, float)
-    metrics.finite(goal)
-    rows, columns = (n // layout.cell for n in goal.shape)
-    if not rows or not columns:
+    if min(goal.shape) < layout.cell:
         raise ValueError(
             f"goal: got {list(goal.shape)} cells, fewer than the {layout.cell} of one step of the tool; give a finer goal"
         )
-    blocks = (
-        goal[: rows * layout.cell, : columns * layout.cell].reshape(rows, layout.cell, columns, layout.cell).mean((1, 3))
-    )
-    dig = np.flipud(blocks < -layout.depth / 2)
+    target = height_goal(goal, kind, name, layout)
+    counts = [max(round(n / layout.cell), math.ceil(n / (layout.cell * layout.oversize))) for n in target.goal.shape]
+    blocks = metrics.resample(target.goal, (counts[0], counts[1]))
+    dig = np.flipud(blocks < -layout.depth / 2 * (1 + 1e-9))
     if not dig.any():
         raise ValueError(
-            f"goal: got no block of {layout.cell} x {layout.cell} cells below {-layout.depth / 2 * 1e3:.3g} mm, "
-            "so there is nothing to dig; lower the goal, or dig less deep"
+            f"goal: got no block of {layout.cell} x {layout.cell} cells below {-layout.depth / 2 * 1e3:.3g} mm, so there is "
+            "nothing to dig; lower the goal, dig less deep, or use the methods that also heap: search or optimise"
         )
-    scene = make_scene(goal.shape, layout.spacing, tool=layout.blade)
+    height, width = (n / count * layout.spacing for n, count in zip(target.goal.shape, counts, strict=True))
     paths, optimal, lower = [], True, 0.0
     for piece in connected_pieces(dig):
         part = np.zeros_like(dig)
         part[tuple(np.array(sorted(piece)).T)] = True
         found = plan(part, seconds=10)
-        path = metrics.cell_centre(np.array(found.cells), rows, layout.cell, 0, layout.spacing)
+        rows, columns = np.array(found.cells, float).T
+        path = np.stack([(columns + 0.5) * width, (counts[0] - rows - 0.5) * height], 1)
         paths.append(np.concatenate([path, path[-1:]]) if len(path) == 1 else path)
         optimal, lower = optimal and found.optimal, lower + found.lower_bound
-    drawn = bool(np.all(goal <= 0))
-    return Target(name, kind, "plan", scene, goal, tuple(paths), drawn, layout.depth, optimal, lower)
+    return replace(target, paths=tuple(paths), optimal=optimal, lower_bound=lower)
 
 
 def glyph_target(strokes: np.ndarray, name: str) -> Target:
@@ -192,9 +200,9 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
     beyond = max(0.0, placed[:, [0, 2]].max() - metrics.GLYPH_SQUARE[1])
     scene = make_scene((32, 32 + math.ceil(beyond / spacing - 1e-6)), spacing, tool=blade)
     paths = tuple(stroke.reshape(2, 2) for stroke in placed)
-    goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, 2)
+    goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, _rounded(2))
     for path in paths:
-        shaped, _ = program(jnp.asarray(goal), jnp.asarray(path, np.float32))
+        shaped, _ = program(jnp.asarray(goal), _padded(path, _rounded(2)))
         check(shaped)
         goal = np.asarray(shaped.height)
     return Target(name, "glyph", "strokes", scene, goal, paths, False, float(blade.depth))
@@ -225,28 +233,25 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) 
     began = time.perf_counter()
     start = at_rest(scene, before, tell)
     prepared = time.perf_counter()
-    tell("compiling")
-    longest = max((len(path) for path in target.paths), default=2)
-    if longest > 2:  # a few lengths for all paths, so that like goals share a program
-        longest = -(-longest // 32) * 32
-    program, compile_seconds = _program(scene, longest)
-    compiled = time.perf_counter()
-    height, frames, tools = start, [start], [_nowhere()]
-    runs = []
-    for number, path in enumerate(target.paths, 1):
-        tell(f"pushing path {number} of {len(target.paths)}")
-        shaped, on_the_way = program(jnp.asarray(height), jnp.asarray(_padded(path, longest), np.float32))
+    height, compile_seconds, run_seconds = start, 0.0, 0.0
+    frames, tools = [start], [_nowhere()]
+    ways = [_divided(path) for path in target.paths]
+    longest = _rounded(max(map(len, ways), default=2))
+    every = math.ceil(sum(map(len, ways)) * start.nbytes / _KEPT) or 1
+    for number, (path, way) in enumerate(zip(target.paths, ways, strict=True), 1):
+        tell(f"pushing path {number} of {len(target.paths)}" if number > 1 else "compiling")
+        program, compile_seconds = _program(scene, longest)
+        began_to_run = time.perf_counter()
+        shaped, on_the_way = program(jnp.asarray(height), _padded(path, longest))
         check(shaped)
-        later = np.asarray(shaped.height)
-        runs.append((height, path, np.asarray(on_the_way), later))
-        height = later
-    ran = time.perf_counter()
-    tell("gathering frames")
-    for earlier, path, legs, later in runs:
-        ways, poses = _moments(scene, earlier, path, legs)
-        frames += [*ways, later]
+        run_seconds += time.perf_counter() - began_to_run
+        if way is not path:
+            on_the_way = program(jnp.asarray(height), _padded(way, longest))[1]
+        maps, poses = _moments(way, np.asarray(on_the_way), every)
+        height = np.array(shaped.height)
+        frames += [*maps, height]
         tools += [*poses, _nowhere()]
-    seconds = {"prepare": prepared - began, "compile": compile_seconds, "run": ran - compiled}
+    seconds = {"prepare": prepared - began, "compile": compile_seconds, "run": run_seconds}
     figures = _figures(target, start, height)
     return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), figures, seconds)
 
@@ -255,7 +260,7 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
     """A surface [H, W] (m) after it has settled; level sand at 0 for None."""
     if before is None:
         return np.zeros(scene.grid.shape, np.float32)
-    metrics.fits(scene, before)
+    metrics.fits(scene, before, "surface")
     tell("settling the surface")
     rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
     check(rested)
@@ -278,6 +283,18 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
     }
 
 
+def _rounded(points: int) -> int:
+    """A few lengths for all paths, so that like goals share a program: single strokes, and others."""
+    return _PARTS + 1 if points <= _PARTS + 1 else -(-points // 32) * 32
+
+
+def _divided(path: np.ndarray) -> np.ndarray:
+    """A single stroke as a path of short legs, for its recording; it leaves all but the same. Other paths as they are."""
+    if len(path) > 2 or not np.any(path[1] - path[0]):
+        return path
+    return path[0] + np.linspace(0, 1, _PARTS + 1)[:, None] * (path[1] - path[0])
+
+
 @cache
 def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]], float]:
     """`follow_frames` for paths of `points` points, compiled ahead, and the seconds that compiling took.
@@ -292,21 +309,17 @@ def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array]
     return program, time.perf_counter() - began
 
 
-def _padded(path: np.ndarray, points: int) -> np.ndarray:
+def _padded(path: np.ndarray, points: int) -> jax.Array:
     """The path with its last point repeated up to `points` points; a leg without length changes nothing."""
-    return np.concatenate([path, np.repeat(path[-1:], points - len(path), axis=0)])
+    return jnp.asarray(np.concatenate([path, np.repeat(path[-1:], points - len(path), axis=0)]), jnp.float32)
 
 
-def _moments(scene: Scene, height: np.ndarray, path: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Maps on the way along a path, and the tool's pose in each: after every leg, or at six places of a single stroke."""
-    if len(path) > 2:
-        runs = np.diff(path, axis=0)
-        return legs[: len(runs)], np.concatenate([path[1:], _headings(runs)], 1)
-    run = path[1] - path[0]
-    parts = np.linspace(0, 1, 7)[1:]
-    ends = np.stack([np.concatenate([path[0], path[0] + part * run]) for part in parts])
-    maps = jax.vmap(lambda stroke: act(scene, jnp.asarray(height), stroke, push=SteppedPush()).height)(jnp.asarray(ends))
-    return np.asarray(maps), np.concatenate([ends[:, 2:], np.repeat(_headings(run[None]), len(ends), 0)], 1)
+def _moments(path: np.ndarray, recorded: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every so many of the maps `recorded` after the legs of a path, and the last, and the tool's pose in each; nothing of
+    what was recorded of the padding behind the path.
+    """
+    after = np.unique(np.append(np.arange(every, len(path), every), len(path) - 1))
+    return recorded[after - 1], np.concatenate([path[after], _headings(np.diff(path, axis=0))[after - 1]], 1)
 
 
 def _headings(runs: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxsand.scene.boundaries import Closed, Draining, Open, Walls
 from jaxsand.scene.grid import Grid, Neighbours
+from jaxsand.scene.masked import unmasked
 from jaxsand.scene.material import DRY_SAND, Material
 from jaxsand.scene.tools import Blade, NoTool, Tool
 from jaxsand.scene.validation import concrete, finite, positive
@@ -184,7 +185,8 @@ def fit(scene: Scene, height: Float[ArrayLike, "H W"]) -> tuple[Scene, Float[Arr
 
 
 def as_array(name: str, value: ArrayLike | npt.ArrayLike, dtype: DTypeLike | None = None) -> jax.Array:
-    """The value as an array; raises a ValueError that bears the name if it is none."""
+    """The value as an array; raises a ValueError that bears the name if it is none, or has masked cells."""
+    value = unmasked(name, value)
     try:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError) as error:
@@ -232,7 +234,10 @@ def _angle(angle: object, shape: tuple[int, int]) -> None:
 
 
 def _as_walls(walls: Open | Walls) -> Open | Walls:
-    return Walls(jnp.asarray(walls.solid)) if isinstance(walls, Walls) and not hasattr(walls.solid, "dtype") else walls
+    if not isinstance(walls, Walls):
+        return walls
+    solid = unmasked("walls.solid", walls.solid)
+    return Walls(solid if hasattr(solid, "dtype") else jnp.asarray(solid))
 
 
 def _check_walls(walls: object, shape: tuple[int, int]) -> None:

@@ -5,13 +5,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsand.scene.masked import gaps
+
 
 def concrete(value: object) -> np.ndarray | None:
     """The value as a numpy array (NaN for what is no number), or None if it is being traced."""
     if isinstance(value, jax.core.Tracer):
         return None
     try:
-        array = np.asarray(value)
+        array = np.asarray(gaps(value))
     except (TypeError, ValueError):
         return None
     return array if array.dtype.kind in "fiub" else np.full((), np.nan)

@@ -58,12 +58,12 @@ class Measured:
     tilt: np.ndarray
 
 
-def read_scans(path: str | Path) -> dict[tuple[float, float], list[Scan]]:
+def read_scans(path: str | Path, no_data: float | None = None) -> dict[tuple[float, float], list[Scan]]:
     """Reads all scans of a CSV file.
 
     The header names the columns: those of `COLUMNS` in any order, and others, which are ignored. Fields are separated by
     commas, or by semicolons or tabs (a comma is then a decimal point). Lines that start with # are comments. A height that
-    is empty or nan is a drop-out.
+    is empty, nan or `no_data` (mm) is a drop-out.
 
     Returns:
       Lists of scans by trench (beta_deg, sinkage_mm), rising.
@@ -71,7 +71,7 @@ def read_scans(path: str | Path) -> dict[tuple[float, float], list[Scan]]:
     Raises:
       ValueError: if the file cannot be read; names the line and what is wrong.
     """
-    table, scans = _table(path), dict[tuple[float, float], list[Scan]]()
+    table, scans = _table(path, no_data), dict[tuple[float, float], list[Scan]]()
     for beta, sinkage, number in np.unique(table[:, :3], axis=0).tolist():
         rows = table[(table[:, :3] == (beta, sinkage, number)).all(1)]
         x, z, line = rows[np.isfinite(rows[:, 4]), 3:].T
@@ -204,7 +204,7 @@ def _samples(left: float, right: float) -> np.ndarray:
     return np.arange(math.ceil(left / STEP - 1e-9), math.floor(right / STEP + 1e-9) + 1) * STEP
 
 
-def _table(path: str | Path) -> np.ndarray:
+def _table(path: str | Path, no_data: float | None) -> np.ndarray:
     """Rows of `COLUMNS` and the line's number, x rising."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
@@ -222,17 +222,19 @@ def _table(path: str | Path) -> np.ndarray:
         fields = [field.strip(' "').replace(",", ".") for field in text.split(sign)]
         if len(fields) != len(names):
             raise ValueError(f"measured: {len(fields)} fields in line {line}, {len(names)} in the header; give as many")
-        rows.append([_number(fields[names.index(name)], name, line) for name in COLUMNS] + [line])
+        rows.append([_number(fields[names.index(name)], name, line, no_data) for name in COLUMNS] + [line])
     if not rows:
         raise ValueError(f"measured: no rows below line {head} of {path}; give one for each point of a scan")
     return np.array(sorted(rows, key=lambda row: row[3]))
 
 
-def _number(text: str, name: str, line: int) -> float:
+def _number(text: str, name: str, line: int, no_data: float | None) -> float:
     try:
         value = float(text or "nan")
     except ValueError:
         value = math.inf
+    if name == "z_mm" and value == no_data:
+        return math.nan
     if not (abs(value) <= 1000 or (math.isnan(value) and name == "z_mm")) or (name == "scan" and value % 1):
         remedy = "a whole number" if name == "scan" else "degrees, or millimetres up to 1000 and nan for drop-outs"
         raise ValueError(f"measured: {name} is {text!r} in line {line}; give {remedy}")

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from jaxsand.relaxation.stopping import check_whole
+from jaxsand.scene.masked import gaps
 from jaxsand.terramechanics._least_squares import Calibration, Ends, Free, Range, as_ranges, check_noise, conclude, spread
 from jaxsand.terramechanics.wheel_trench import Pass, Profile, relaxing
 
@@ -29,7 +30,7 @@ class Section:
     Args:
       run: the wheel's pass: what is known of it, and a guess of what is free.
       x: places across the trench [n] (m), 0 at the middle of the cut, positive to the right of the wheel's way; finite.
-      z: heights [n] (m) above the level sand; NaN where not seen.
+      z: heights [n] (m) above the level sand; NaN or masked where not seen.
 
     Raises:
       ValueError: if x and z differ in shape, or x is not finite.
@@ -51,8 +52,9 @@ class Section:
     def __post_init__(self) -> None:
         if np.ndim(self.x) != 1 or np.shape(self.x) != np.shape(self.z):
             raise ValueError(f"x, z: got shapes {np.shape(self.x)} and {np.shape(self.z)}; give two rows of equal length")
-        if not np.isfinite(self.x).all():
+        if not np.isfinite(gaps(self.x)).all():
             raise ValueError("x: got a NaN or an infinity; leave such points out")
+        object.__setattr__(self, "z", np.asarray(gaps(self.z)))
 
 
 def calibrate_sections(

@@ -12,6 +12,7 @@ from PIL import Image
 
 from jaxsand.__main__ import main
 from jaxsand.goals.metrics import volume_error
+from jaxsand.planning.search.rollouts import Effort
 
 L_MAP = "#..\n#..\n###\n"
 
@@ -31,8 +32,11 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
     (tmp_path / "broken.npy").write_bytes(b"rubbish")
     (tmp_path / "a-file").write_text("")
+    (tmp_path / "land.xyz").write_text("0 0 0")
     np.save(tmp_path / "cube.npy", np.zeros((2, 2, 2)))
     np.save(tmp_path / "flat.npy", np.zeros((12, 12), np.float32))
+    np.save(tmp_path / "dip.npy", np.full((12, 12), -0.01))
+    np.save(tmp_path / "holes.npy", np.where(np.arange(12) == 8, -9999, np.zeros((12, 12), int)))
     np.save(tmp_path / "nan.npy", np.full((12, 12), np.nan))
     np.save(tmp_path / "small.npy", -np.ones((3, 3)))
     np.save(tmp_path / "words.npy", np.array([["a"]]))
@@ -79,6 +83,26 @@ BAD = {
     "depth of none": (["shape", "S", "--depth-mm", "0"], "depth-mm: got 0.0"),
     "resolution of none": (["shape", "S", "--resolution", "0"], "resolution: got '0'"),
     "resolution beyond reason": (["shape", "S", "--resolution", "9999"], "resolution: got 9999"),
+    "goal without data": (["shape", "holes.npy", "--no-data", "-9999"], "goal: got 12 cells that are not finite; fill"),
+    "searched goal without data": (
+        ["shape", "holes.npy", "--no-data", "-9999", "--method", "search"],
+        "goal: got 12 cells that are not finite; fill",
+    ),
+    "surface without data": (
+        ["shape", "dip.npy", "--no-data", "-9999", "--surface", "holes.npy"],
+        "surface: got 12 cells that are not finite; fill",
+    ),
+    "no data of a letter": (["shape", "S", "--no-data", "-9999"], r"no-data: has an effect on \.npy files only"),
+    "no data of no scans": (["trench", "--no-data", "-9999"], "no-data: has an effect on --measured only"),
+    "elevations as text": (["shape", "land.asc"], r"goal: got 'land.asc', and \.asc is not read; .*\.npy.*first row"),
+    "elevations to push a text": (["shape", "land.tif", "--method", "strokes"], r"goal: got 'land.tif', and \.tif is not"),
+    "elevations of a file": (["shape", "land.xyz"], r"goal: got 'land.xyz', and \.xyz is not read"),
+    "elevations to settle": (
+        ["settle", "land.asc", "--out-file", "x.npy"],
+        r"land.asc: \.asc is not read; give a \.npy file.*numpy\.save.*flipud",
+    ),
+    "elevations as a surface": (["shape", "S", "--surface", "land.tif"], r"surface: got 'land.tif'; give .*\.npy file"),
+    "first row of a letter": (["shape", "S", "--first-row", "top"], r"first-row: has an effect on \.npy files only"),
     "unknown surface": (["shape", "S", "--surface", "moon"], "surface: got 'moon'"),
     "surface of another size": (["shape", "S", "--surface", "flat.npy"], r"surface: got shape \[12, 12\]"),
     "folder under a file": (["shape", "S", "--out", "a-file/x"], "out: cannot write to a-file/x"),
@@ -86,7 +110,10 @@ BAD = {
     "out file of another kind": (["settle", "pile.npy", "--out-file", "x.txt"], "out-file: got x.txt"),
     "no input": (["settle", "none.npy", "--out-file", "x.npy"], "none.npy: no such file"),
     "words to settle": (["settle", "words.npy", "--out-file", "x.npy"], "words.npy: got dtype"),
-    "nan to settle": (["settle", "nan.npy", "--out-file", "x.npy"], "nan.npy: got 144 cells that are not finite"),
+    "nan to settle": (
+        ["settle", "nan.npy", "--out-file", "x.npy"],
+        "nan.npy: got 144 cells that are not finite; .*--no-data nan",
+    ),
     "right angle": (["settle", "pile.npy", "--out-file", "x.npy", "--repose-deg", "90"], "repose_angle: "),
     "six neighbours": (["settle", "pile.npy", "--out-file", "x.npy", "--neighbours", "6"], "neighbours: invalid choice"),
     "spacing zero": (["settle", "pile.npy", "--out-file", "x.npy", "--spacing", "0"], "spacing: got 0.0"),
@@ -221,6 +248,57 @@ def test_plan_with_an_end_turns_and_a_picture(here, capsys):
     assert json.loads(data.read_text())["path"] == report["path"]
 
 
+GOALS_WITHOUT_A_BINARY_PLAN = {"level": 0.0, "mound": 0.01, "shallow trench": -0.003}
+
+
+@pytest.mark.parametrize("method", ["search", "optimise"])
+@pytest.mark.parametrize("name", GOALS_WITHOUT_A_BINARY_PLAN)
+def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypatch, name, method):
+    """The method gets the goal, on sand at rest, and a blade that digs no deeper; what it finds is compared whole."""
+    from jaxsand.planning import methods, pipeline
+
+    goal = np.zeros((12, 12))
+    goal[4:8, 2:10] = GOALS_WITHOUT_A_BINARY_PLAN[name]
+    np.save(here / "goal.npy", goal)
+    np.save(here / "rough.npy", np.linspace(-0.005, 0.005, 144).reshape(12, 12))
+    asked = []
+
+    def plan_sand(scene, start, goal, **options):
+        asked.append((scene, start, goal))
+        return methods.SandPlan((), start, 1.0, 1.0, 0.0, 0.0, Effort())
+
+    def optimise_strokes(scene, goal, start, **options):
+        asked.append((scene, start, goal))
+        return methods.Optimised(np.zeros((0, 4)), np.ones(1), np.zeros(1), 0, start)
+
+    def plan(*_, **__):
+        raise AssertionError("a binary plan that nobody uses")
+
+    monkeypatch.setattr(methods, "plan_sand", plan_sand)
+    monkeypatch.setattr(methods, "optimise_strokes", optimise_strokes)
+    monkeypatch.setattr(pipeline, "plan", plan)
+    assert main(["shape", "goal.npy", "--surface", "rough.npy", "--method", method, "--out", "out", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    ((scene, start, given),) = asked
+    assert np.array_equal(given, goal)
+    assert np.ptp(start) == pytest.approx(0.01, rel=0.1)
+    assert float(scene.tool.depth) == report["blade"]["depth"] == max(0, -goal.min())
+    assert (report["method"], report["strokes"], report["l2_reduction"]) == (method, [], 0)
+    assert report["l2_reduction"] == report["l2_reduction_with_berms"]
+
+
+@pytest.mark.slow
+def test_rough_sand_is_levelled(here, capsys):
+    np.save(here / "level.npy", np.zeros((16, 16)))
+    y, x = np.indices((16, 16)) * 1.0
+    np.save(here / "rough.npy", 0.006 * np.sin(x / 2) * np.cos(y / 3))
+    arguments = ["shape", "level.npy", "--surface", "rough.npy", "--method", "search", "--strokes", "2", "--pushes", "40"]
+    assert main([*arguments, "--resolution", "3", "--out", "out", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["l2_reduction"] == pytest.approx(1 - report["search"]["after"] / report["search"]["before"], abs=1e-3)
+    assert report["l2_reduction"] > 0.05
+
+
 @pytest.mark.slow
 def test_search_on_real_sand(here, capsys):
     y, x = np.indices((16, 20)) * 1.0
@@ -309,3 +387,45 @@ def test_pictures_do_not_depend_on_the_users_matplotlib(tmp_path):
         assert done.returncode == 0, done.stderr
         pictures.append((tmp_path / "plan-map.png").read_bytes())
     assert pictures[0] == pictures[1]
+
+
+def test_cells_without_data_are_solid_to_settling(here, capsys):
+    heights = np.eye(12) * 0.05
+    heights[:, 8] = -9999
+    for dtype, no_data in ((np.float32, "-9999"), (np.float64, "nan")):
+        np.save(here / "holes.npy", np.where(heights == -9999, float(no_data), heights).astype(dtype))
+        arguments = ["settle", "holes.npy", "--out-file", "out.npy", "--json"]
+        assert main([*arguments, f"--no-data={no_data}"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        settled = np.load(here / "out.npy")
+        assert (report["outcome"], settled.dtype) == ("clean", dtype)
+        assert report["volume_error"] <= 1e-6
+        assert np.array_equal(settled[:, 8], np.full(12, float(no_data)), equal_nan=True)
+        assert settled[:, :8].sum() == pytest.approx(8 * 0.05, abs=1e-6)
+        assert settled[:, 9:].sum() == pytest.approx(3 * 0.05, abs=1e-6)
+
+
+def test_the_first_row_lies_where_help_says(here, capsys):
+    from jaxsand.cli.parser import _parser
+    from jaxsand.cli.shape import _target
+
+    rows = np.zeros((24, 24))
+    rows[:6] = -0.01
+    np.save(here / "first.npy", rows)
+    Image.fromarray(np.where(rows < 0, 0, 255).astype(np.uint8)).save(here / "first.png")
+    on_top = {
+        "first.png": True,
+        "first.npy": False,
+        "first.npy --first-row bottom": False,
+        "first.npy --first-row top": True,
+    }
+    for arguments, expected in on_top.items():
+        target = _target(_parser().parse_args(["shape", *arguments.split()]))
+        middle = len(target.goal) // 2
+        assert (target.goal[:middle].sum() > target.goal[middle:].sum()) == expected
+        assert all((path[:, 1] > middle * 0.01).all() == expected for path in target.paths)
+    with pytest.raises(SystemExit):
+        main(["shape", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert ".png (dark is dug; first row on top)" in said
+    assert ".npy height map in m (first row at the bottom" in said

@@ -5,11 +5,12 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import jaxsand.gym
-from jaxsand.envs import LevelGoals, OnlyDug, OnSand, Stop, Together, map_pool
+from jaxsand.envs import LevelGoals, OnlyDug, OnSand, Stop, Together, Walks, map_pool
 from jaxsand.goals.letters import letter_map
 from jaxsand.interaction.stepped import SteppedPush
 
@@ -189,3 +190,73 @@ def test_forked_processes_are_told_what_to_do_instead_of_hanging(monkeypatch):
     monkeypatch.setattr("jaxsand.envs.gymnasium._AT_HOME", -1)
     with pytest.raises(RuntimeError, match=r'vectorization_mode: .*forked.*"context": "spawn"'):
         gymnasium.make("jaxsand/MultiStroke-v0")
+
+
+def test_a_mask_begins_only_some_environments_anew():
+    envs = jaxsand.gym.SandVectorEnv("single-stroke", 3, goals=POOL, limit=4)
+    envs.reset(seed=1)
+    before = envs.step(np.array([0, 1, 2]))[0]
+    alone = single(limit=4).reset(seed=12)[0]
+    obs, info = envs.reset(seed=[None, 12, None], options={"reset_mask": np.array([False, True, False])})
+    for name, plane in obs.items():
+        assert np.array_equal(plane[[0, 2]], before[name][[0, 2]])
+        assert np.array_equal(plane[1], alone[name])
+    assert info["_action_mask"].tolist() == [False, True, False]
+    assert info["action_mask"][1].any()
+    assert not info["action_mask"][[0, 2]].any()
+    for step in range(3):  # the others are as far as they were
+        truncated = envs.step(np.zeros(3, int))[3]
+        assert truncated.tolist() == [step == 2, False, step == 2]
+
+
+def test_seeds_can_be_a_list():
+    envs = jaxsand.gym.SandVectorEnv("single-stroke", 3, goals=Walks())
+    listed, _ = envs.reset(seed=[5, 6, 7])
+    counted, _ = envs.reset(seed=5)
+    for name in listed:
+        assert np.array_equal(listed[name], counted[name])
+    back, _ = envs.reset(seed=np.array([7, 6, 5]))
+    assert np.array_equal(back["goal"], listed["goal"][::-1])
+
+
+def test_what_reset_does_not_know_is_named():
+    envs = jaxsand.gym.SandVectorEnv("single-stroke", 2, goals=POOL)
+    with pytest.raises(ResetNeeded, match="reset a part"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    for mask in ([True], [1, 0], [False, False]):
+        with pytest.raises(ValueError, match="^reset_mask: got .*; give 2 booleans"):
+            envs.reset(options={"reset_mask": np.array(mask)})
+    with pytest.raises(ValueError, match="^seed: got 3 for 2 environments"):
+        envs.reset(seed=[1, 2, 3])
+    for env in (envs, jaxsand.gym.SingleStrokeEnv(goals=POOL)):
+        with pytest.raises(ValueError, match="^options: got 'goal', no option of reset"):
+            env.reset(options={"goal": 1})
+
+
+def test_nothing_goes_before_the_first_reset():
+    kinds = {"render_mode": "rgb_array"}
+    for env, action in (
+        (jaxsand.gym.SingleStrokeEnv(**kinds), 0),
+        (jaxsand.gym.MultiStrokeEnv(**QUICK, **kinds), np.zeros(4)),
+        (jaxsand.gym.SandVectorEnv("single-stroke", 2, **kinds), np.zeros(2, int)),
+    ):
+        with pytest.raises(ResetNeeded, match="step before the first reset"):
+            env.step(action)
+        with pytest.raises(ResetNeeded, match="render before the first reset"):
+            env.render()
+
+
+def test_rewards_of_flattened_goals():
+    env = jaxsand.gym.MultiStrokeEnv(**QUICK)
+    rng = np.random.default_rng(0)
+    before, achieved, desired = rng.normal(size=(3, 2, 32, 32))
+    infos = [{"previous": one} for one in before]
+    rewards = env.compute_reward(achieved, desired, infos)
+    apart = [np.sqrt(((desired - maps) ** 2).sum((1, 2))) for maps in (before, achieved)]
+    assert rewards == pytest.approx(apart[0] - apart[1])
+    flat = [maps.reshape(2, 1024) for maps in (achieved, desired)]
+    assert np.array_equal(env.compute_reward(*flat, np.array(infos)), rewards)
+    assert env.compute_reward(flat[0][0], flat[1][0], infos[0]) == rewards[0]
+    assert env.compute_reward(achieved[0], desired[0], infos[0]) == rewards[0]
+    with pytest.raises(ValueError, match=r"^achieved_goal: got shape \[2, 1024\] for 1 infos; give \[32, 32\]"):
+        env.compute_reward(flat[0], flat[1][0], infos[0])

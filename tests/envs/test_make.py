@@ -111,3 +111,12 @@ def test_only_what_is_dug_counts_for_drawn_goals():
 def test_what_cannot_be_made_is_said(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_goals_that_are_ready_hold_no_cells_without_data():
+    maps = np.ma.masked_equal(np.where(np.arange(32) == 3, -9999.0, np.zeros((1, 32, 32))), -9999)
+    for ready in (envs.LevelGoals(maps), envs.LevelGoals(maps.filled(np.nan))):
+        with pytest.raises(ValueError, match="^goals: got 32 cells that are not finite"):
+            js.make("multi-stroke", goals=ready)
+    with pytest.raises(ValueError, match="^starts: got 32 cells that are not finite"):
+        js.make("multi-stroke", goals=envs.RoughGoals(np.zeros((1, 32, 32)), maps))

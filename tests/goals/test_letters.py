@@ -69,6 +69,27 @@ def test_pictures(tmp_path):
         letters.read_image(tmp_path / "b.png")
 
 
+def test_transparency_counts_as_white_whatever_the_bits(tmp_path):
+    shades = np.array([[0, 128, 255], [255, 128, 0]])
+    for bits, values in ((8, shades.astype(np.uint8)), (16, (shades * 257).astype(np.uint16))):
+        Image.fromarray(values).save(tmp_path / "whole.png")
+        Image.fromarray(values).save(tmp_path / "clear.png", transparency=int(values[0, 1]))
+        with Image.open(tmp_path / "clear.png") as image:
+            assert (image.info["transparency"], image.mode.startswith("I")) == (int(values[0, 1]), bits == 16)
+        whole, clear = (letters.read_image(tmp_path / name) for name in ("whole.png", "clear.png"))
+        assert whole == pytest.approx(np.array([[0, -127 / 255, -1], [-1, -127 / 255, 0]]))
+        assert clear == pytest.approx(np.where(np.abs(whole + 127 / 255) < 1e-6, 0, whole))
+
+
+def test_numbers_that_are_no_shades_are_refused_whatever_their_name(tmp_path):
+    for number, values in enumerate((np.zeros((2, 2), np.float32), np.zeros((2, 2), np.int32))):
+        Image.fromarray(values).save(tmp_path / f"{number}.png", format="TIFF")
+        with pytest.raises(ValueError, match="png: got a TIFF of numbers"):
+            letters.read_image(tmp_path / f"{number}.png")
+    Image.new("L", (2, 2), 0).save(tmp_path / "shades.png", format="TIFF")
+    assert np.array_equal(letters.read_image(tmp_path / "shades.png"), np.full((2, 2), -1))
+
+
 def test_height_files(tmp_path):
     np.save(tmp_path / "h.npy", np.eye(3))
     assert np.array_equal(letters.read_heights(tmp_path / "h.npy"), np.eye(3))

@@ -1,13 +1,20 @@
 """The main job, on all letters."""
 
 import string
+import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import jaxsand as js
 from jaxsand.goals import letters, metrics, surfaces
 from jaxsand.goals.metrics import volume_error
 from jaxsand.planning import pipeline
+from jaxsand.scene.scene import make_scene
+from jaxsand.scene.tools import Blade
+
+GLYPHS = make_scene((32, 32), 0.01, tool=Blade())
 
 
 def shape(target, before=None):
@@ -66,7 +73,7 @@ def test_a_rough_surface_is_settled_first():
     assert np.ptp(land) == pytest.approx(0.006)
     result = shape(target, land)
     assert result.figures["iou"] > 0.5
-    with pytest.raises(ValueError, match="goal: got shape"):
+    with pytest.raises(ValueError, match="surface: got shape"):
         shape(target, np.zeros((3, 3)))
 
 
@@ -88,3 +95,72 @@ def test_goals_that_cannot_be_dug():
         goal = -np.ones((12, 12))
         goal[8, 8] = np.inf
         pipeline.height_target(goal, "heights", "broken", layout)
+
+
+def test_what_is_left_over_of_blocks_is_planned_too():
+    goal = np.zeros((53, 53))
+    goal[10:16, 6:46] = goal[48:53, 6:46] = -0.0075
+    layout = pipeline.Layout(depth=0.0075)
+    found = pipeline.height_target(goal, "heights", "two", layout)
+    assert len(found.paths) == 2
+    assert found.optimal
+    for path, (low, high) in zip(sorted(found.paths, key=lambda p: p[0, 1]), ((0.10, 0.16), (0.48, 0.53)), strict=True):
+        assert np.all((path[:, 1] > low) & (path[:, 1] < high))
+    for side in range(6, 40):  # no path misses what lies at an edge, and the blade covers every block
+        goal = np.zeros((side, 18))
+        goal[-min(6, 2 * side // 3) :] = -0.0075
+        (path,) = pipeline.height_target(goal, "heights", "edge", layout).paths
+        reach = layout.oversize * layout.cell * layout.spacing / 2
+        assert path[:, 1].max() + reach >= side * layout.spacing - 1e-9
+        assert path[:, 1].max() < side * layout.spacing
+
+
+def test_blocks_of_whole_cells_lie_as_ever():
+    goal = np.zeros((24, 30))
+    goal[6:12, 12:24] = -0.0075
+    (path,) = pipeline.height_target(goal, "heights", "slot", pipeline.Layout(depth=0.0075)).paths
+    assert np.allclose(path, [[0.15, 0.09], [0.21, 0.09]]) or np.allclose(path, [[0.21, 0.09], [0.15, 0.09]])
+
+
+def test_a_recording_takes_no_more_memory_than_its_frames(monkeypatch):
+    """One path of 96 legs beside forty of two: nothing of what a padded program records stays but the frames that are
+    shown, and their number is bounded."""
+    scene = make_scene((40, 40), 0.01, tool=Blade())
+    to_and_fro = np.stack([0.1 + 0.1 * (np.arange(97) % 2), np.full(97, 0.2)], 1)
+    target = pipeline.Target(
+        "many", "heights", "plan", scene, np.zeros((40, 40)), (to_and_fro, *[to_and_fro[:3]] * 40), True, 0.0
+    )
+
+    def program(scene, points):
+        def run(height, path):
+            frames = np.zeros((points - 1, *height.shape), np.float32)
+            return SimpleNamespace(height=np.asarray(height) + 1, outcome=np.zeros((), int)), frames
+
+        return run, 0.0
+
+    monkeypatch.setattr(pipeline, "_program", program)
+    monkeypatch.setattr(pipeline, "_figures", lambda *_: {})
+    for kept, most in ((pipeline._KEPT, 1 + 97 + 40 * 3), (80 * 40 * 40 * 4, 1 + 41 * 2 + 96 // 3 + 1 + 40)):
+        monkeypatch.setattr(pipeline, "_KEPT", kept)
+        tracemalloc.start()
+        result = shape(target)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert len(result.frames) == len(result.tools) <= most
+        assert peak < 3 * result.frames.nbytes + 4 * 127 * result.frames[0].nbytes  # and not 41 * 127
+        assert np.array_equal(result.tools[-2], [*to_and_fro[2], -1, 0])
+
+
+def test_a_strokes_recording_is_its_way():
+    stroke = [0.08, 0.1, 0.2, 0.16]
+    target = pipeline.Target(
+        "one", "glyph", "strokes", GLYPHS, np.zeros((32, 32)), (np.reshape(stroke, (2, 2)),), False, 0.0075
+    )
+    result = shape(target)
+    assert len(result.frames) == len(result.tools) == 8
+    assert result.tools[3] == pytest.approx([0.14, 0.13, 2 / 5**0.5, 1 / 5**0.5])
+    half = js.act(GLYPHS, np.zeros((32, 32), np.float32), [*stroke[:2], 0.14, 0.13]).height
+    assert np.abs(result.frames[3] - half).max() < 0.02 * 0.0075
+    whole = js.step(GLYPHS, np.zeros((32, 32), np.float32), stroke).height
+    assert np.abs(result.after - whole).max() < 1e-6
+    assert np.array_equal(result.frames[-1], result.after)

@@ -196,3 +196,9 @@ def test_the_search_ends_a_fifth_closer_than_its_rivals_on_five_tasks():
     assert len(closer) == 5
     assert min(closer) >= 0.2
     assert all(row["lower_bound"] <= row["after"] + 1e-9 for row in rows)
+
+
+def test_maps_that_differ_in_their_last_row_alone_are_told_apart():
+    maps = np.zeros((2, 5, 4))
+    maps[1, 4] = 1
+    assert len(set(marks(maps, 0.1))) == 2

@@ -10,6 +10,7 @@ import pytest
 import jaxsand as js
 from jaxsand.bench.calibration import bench_calibrate, bench_cone, cone
 from jaxsand.terramechanics._least_squares import Range, climb, conclude, spread
+from jaxsand.terramechanics.calibration import _grouped
 from jaxsand.terramechanics.wheel_trench import Pass, closed_form, relaxed
 
 SHAPE, DX, NOISE = (32, 32), 0.01, 6e-4
@@ -323,3 +324,13 @@ def test_refusals_name_field_value_and_remedy(case):
     call, message = REFUSED[case]
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_masked_cells_were_not_seen():
+    raw = np.zeros((4, 4))
+    raw[1, 2] = -9999
+    for after in (np.ma.masked_equal(raw, -9999), np.where(raw == -9999, np.nan, raw)):
+        (group,), seen = _grouped(js.make_scene((4, 4), 0.01), [js.Trial(np.zeros((4, 4)), after)])
+        assert seen == 15
+        assert np.array_equal(group.seen[0], raw == 0)
+        assert not np.any(group.after)

@@ -338,3 +338,13 @@ def test_mistakes_of_other_kinds_are_told(tmp_path):
     steep = scans.Scan(3, np.arange(100) * MM, np.arange(100) * MM)
     with pytest.raises(ValueError, match="measured: scan 3 is tilted by more than 10 degrees; level it"):
         scans.align(steep, section(5 * MM, 0, 0))
+
+
+def test_heights_without_data_are_drop_outs(tmp_path):
+    rows = [f"0,5,1,{k},{-9999 if k in (3, 7) else 0}" for k in range(25)]
+    (tmp_path / "scans.csv").write_text("\n".join([",".join(scans.COLUMNS), *rows]))
+    (scan,) = scans.read_scans(tmp_path / "scans.csv", -9999)[0, 5]
+    assert (scan.dropouts, scan.x.size) == (2, 23)
+    assert not scan.z.any()
+    with pytest.raises(ValueError, match="z_mm is '-9999' in line 5"):
+        scans.read_scans(tmp_path / "scans.csv")

@@ -304,3 +304,18 @@ def test_progress_tells_the_rate_the_score_and_the_time_to_go(tmp_path):
     assert said[0].startswith("tiny: chunk 1, ")
     assert "a second, 0.0 min to go" in said[0]
     assert said[-1].endswith("score 0.991 (best 0.991), 0.0 min to go")
+
+
+def test_what_keeps_a_run_from_going_on_is_named(tmp_path):
+    state = {"key": jax.random.key(0), "w": np.zeros(3, np.float32), "x": np.zeros(2, np.float32)}
+    checkpoints.save(tmp_path / "last.npz", state, checkpoints.At())
+    wide = state | {"w": np.zeros(3), "x": np.zeros(2)}
+    with pytest.raises(ValueError, match=r"holds float32\[3\] as w, this learner float64\[3\]; .*JAX_ENABLE_X64=0"):
+        checkpoints.load(tmp_path / "last.npz", wide)
+    with pytest.raises(ValueError, match=r"holds uint32\[2\] as key, this learner uint32\[4\]; set jax_default_prng_impl"):
+        checkpoints.load(tmp_path / "last.npz", state | {"key": jax.random.key(0, impl="rbg")})
+    with pytest.raises(ValueError, match=r"holds float32\[2\] as x, this learner float64\[5\]; use its own learner"):
+        checkpoints.load(tmp_path / "last.npz", wide | {"x": np.zeros(5)})
+    checkpoints.save(tmp_path / "wide.npz", wide, checkpoints.At())
+    with pytest.raises(ValueError, match=r"JAX_ENABLE_X64=1"):
+        checkpoints.load(tmp_path / "wide.npz", state)

@@ -26,6 +26,7 @@ State = Any
 
 _ABOUT, _STATE = "about", "state/"
 _OURS = ("train", "jaxsand")
+_OTHER = "use its own learner"
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error)
 
 
@@ -77,12 +78,12 @@ def load(path: Path, like: State) -> tuple[State, At]:
     with _opened(path) as data:
         at = At(**json.loads(str(data[_ABOUT])))
         arrays = {name: data[name] for name in data.files if name != _ABOUT}
-    for name in leaves.keys() | arrays.keys():
-        have, want = (_kind(arrays.get(name)), _kind(_plain(leaves.get(name))))
-        if have != want:
-            raise ValueError(
-                f"run: {path} holds {have} as {name.removeprefix(_STATE)}, this learner {want}; use its own learner"
-            )
+    other = [name for name in sorted(leaves.keys() | arrays.keys()) if _kind(arrays.get(name)) != _kind(leaves.get(name))]
+    if other:
+        advice = {name: _advice(arrays.get(name), leaves.get(name)) for name in other}
+        name = next((name for name in other if advice[name] == _OTHER), other[0])
+        have, want = _kind(arrays.get(name)), _kind(leaves.get(name))
+        raise ValueError(f"run: {path} holds {have} as {name.removeprefix(_STATE)}, this learner {want}; {advice[name]}")
     filled = [_like(leaf, arrays[name]) for name, leaf in leaves.items()]
     return jax.tree.unflatten(jax.tree.structure(like), filled), at
 
@@ -173,6 +174,21 @@ def _like(leaf: object, array: np.ndarray) -> jax.Array | np.ndarray:
     return jnp.asarray(array) if isinstance(leaf, jax.Array) else array
 
 
-def _kind(array: jax.Array | np.ndarray | None) -> str:
+def _kind(leaf: jax.Array | np.ndarray | None) -> str:
     """Dtype and shape, for messages."""
-    return "nothing" if array is None else f"{np.dtype(array.dtype).name}{list(array.shape)}"
+    if leaf is None:
+        return "nothing"
+    array = _plain(leaf)
+    return f"{np.dtype(array.dtype).name}{list(array.shape)}"
+
+
+def _advice(array: np.ndarray | None, leaf: jax.Array | np.ndarray | None) -> str:
+    """What makes a learner's leaf what a file holds: JAX's settings, where the two differ in nothing else."""
+    if array is None or leaf is None:
+        return _OTHER
+    if _is_key(leaf):
+        return "set jax_default_prng_impl as it was when the run was made"
+    have, want = np.dtype(array.dtype), np.dtype(leaf.dtype)
+    if have.kind == want.kind and {have.itemsize, want.itemsize} == {4, 8} and array.shape == leaf.shape:
+        return f"the run was made with JAX_ENABLE_X64={int(have.itemsize == 8)}, so set it"
+    return _OTHER

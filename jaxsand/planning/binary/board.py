@@ -9,6 +9,8 @@ from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
+from jaxsand.scene.masked import unmasked
+
 MOVES = {"N": (-1, 0), "E": (0, 1), "S": (1, 0), "W": (0, -1)}
 Cell = tuple[int, int]
 _DEAREST = 10**6
@@ -74,6 +76,7 @@ def make_problem(dig: ArrayLike, start: ArrayLike | None = None, end: Cell | Non
       ValueError: for a map that is empty or falls into pieces (it names them), a start or end that is not a cell to dig, or
         a cost below 0.
     """
+    dig = unmasked("map", dig)
     try:
         dig = np.asarray(dig)
     except ValueError:

@@ -17,6 +17,7 @@ from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses
 from jaxsand.planning.stroke_loss import Best, SandLoss, pushed
 from jaxsand.relaxation.stopping import check_whole
+from jaxsand.scene.masked import gaps
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, as_array, blade_of
 
@@ -141,7 +142,7 @@ def optimise_strokes(
     sand = SandLoss(
         scene,
         level if start is None else np.asarray(as_array("start", start), np.float32),
-        np.asarray(as_array("goal", goal), np.float32),
+        np.asarray(as_array("goal", gaps(goal)), np.float32),
     )
     rng = np.random.default_rng(_entropy(key))
     account = Account(sand, budget, tell)

@@ -14,6 +14,7 @@ from jaxsand.planning.search.steps import search_steps
 from jaxsand.planning.search.strokes import search_strokes
 from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.relaxation.stopping import check_whole
+from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene, as_array, fit
 
 
@@ -136,11 +137,10 @@ def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Pat
 
 def _checked(scene: Scene, height: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     blade_size(scene)
-    height = np.asarray(fit(scene, as_array("height", np.asarray(height), np.float32))[1])
-    goal = np.asarray(goal, float)
+    height = np.asarray(fit(scene, as_array("height", height, np.float32))[1])
+    goal = np.asarray(gaps(goal), float)
     metrics.fits(scene, goal)
-    if not np.isfinite(height).all():
-        raise ValueError(f"height: got {int(np.sum(~np.isfinite(height)))} cells that are not finite; fill them first")
+    metrics.finite(height, "height")
     slope, mu = float(steepest_slope(scene, height)), np.tan(np.asarray(scene.material.repose_angle, float))
     if slope > np.max(mu) + 2e-3:
         raise ValueError(f"height: got a slope of {slope:.3g}, steeper than repose ({np.max(mu):.3g}); settle it first")

@@ -95,8 +95,9 @@ def distinct(marks: list[bytes], parent: np.ndarray, order: np.ndarray, count: i
 
 def marks(maps: np.ndarray, grain: float) -> list[bytes]:
     """A label for each of maps [n, H, W]: means over blocks of 2 x 2 cells, rounded to multiples of `grain` (m)."""
-    rows, columns = (n // 2 * 2 for n in maps.shape[1:])
-    blocks = maps[:, :rows, :columns].reshape(len(maps), rows // 2, 2, columns // 2, 2).mean((2, 4))
+    whole = np.pad(maps, [(0, 0), *((0, n % 2) for n in maps.shape[1:])], mode="edge")
+    rows, columns = whole.shape[1:]
+    blocks = whole.reshape(len(maps), rows // 2, 2, columns // 2, 2).mean((2, 4))
     rounded = np.round(np.where(np.isfinite(blocks), blocks, 0) / grain).astype(np.int32)
     return [one.tobytes() for one in rounded]
 
