@@ -1,24 +1,64 @@
 """float64 is switched on for the laws and orders; what runs in float32 says so. Shapes never promote by accident."""
 
+import gc
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from jax._src import compiler
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, hardly any of them garbage
 
 ANGLE = math.radians(29)
 MU = math.tan(ANGLE)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _programs() -> Iterator[None]:
-    """Compiled programs are dropped file by file: all of them at once exceed what a process may map."""
-    yield
-    jax.clear_caches()
+ROOM = 30_000  # of the 65,530 pieces of memory that Linux lets a process map, of which every program takes some
+HURRY = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+}
+WAYS = {"compiled": {}, "slow": {}, "long": {"xla_cpu_use_fusion_emitters": False}}
+"""XLA's options by a test's marker. In a hurry programs are compiled six times as fast, and run four times as slowly; by the
+older emitters alone they are compiled twice as fast, and run as fast."""
+
+_options: dict[str, Any] = {}
+_xla_options = compiler.get_compile_options
+
+
+def _with_options(*args: Any, **kwargs: Any) -> Any:
+    options = _xla_options(*args, **kwargs)
+    options.env_option_overrides = [*options.env_option_overrides, *_options.items()]
+    return options
+
+
+compiler.get_compile_options = _with_options
+
+
+def _way(item: pytest.Item) -> dict[str, Any]:
+    return next((options for name, options in WAYS.items() if item.get_closest_marker(name)), HURRY)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """In each file, what is compiled in one way runs together."""
+    files, ways = list(dict.fromkeys(item.path for item in items)), [HURRY, *WAYS.values()]
+    items.sort(key=lambda item: (files.index(item.path), ways.index(_way(item))))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Compiled programs are kept for later tests, but not from one way of compiling to the other, nor without end."""
+    way, maps = _way(item), Path("/proc/self/maps")
+    if way != _options or (maps.exists() and maps.read_bytes().count(b"\n") > ROOM):
+        jax.clear_caches()
+    _options.clear()
+    _options.update(way)
 
 
 def turned(stroke: Sequence[float], side: float) -> list[tuple[Callable, tuple[float, ...]]]:

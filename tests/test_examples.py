@@ -15,12 +15,10 @@ EXAMPLES = {name: obj for name, obj in PUBLIC.items() if inspect.isroutine(obj) 
 
 
 @pytest.fixture(autouse=True)
-def _as_users_run_them() -> Iterator[None]:
-    """In float32; and without most of XLA's optimisations, which would take longer than the examples."""
-    jax.config.update("jax_disable_most_optimizations", True)
+def _in_float32() -> Iterator[None]:
+    """As users run them."""
     with jax.enable_x64(False):
         yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def run(name: str, obj: object) -> tuple[int, str]:

@@ -4,8 +4,11 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxsand as js
+
+pytestmark = pytest.mark.compiled
 
 SHAPE = (64, 64)
 

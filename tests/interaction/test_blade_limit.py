@@ -121,6 +121,7 @@ def test_what_drains_from_a_channel_is_its_arithmetic(short):
         assert float(out.drained) == pytest.approx(width * heap, rel=off)
 
 
+@pytest.mark.compiled
 def test_large_maps_are_computed_where_sand_moves():
     level = np.zeros((160, 160), np.float32)
     path = np.array([[0.6, 0.7], [0.75, 0.7], [0.72, 0.83]])

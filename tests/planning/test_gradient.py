@@ -15,6 +15,8 @@ from jaxsand.planning.gradient.moves import Plans, reordered
 from jaxsand.planning.gradient.sketch import guesses, printed, prints
 from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def bar():

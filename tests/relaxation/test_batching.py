@@ -10,6 +10,8 @@ from jaxsand.relaxation import batching as batch
 
 from ..conftest import ANGLE
 
+pytestmark = pytest.mark.compiled
+
 SHAPE, DX = (16, 12), 0.01
 
 

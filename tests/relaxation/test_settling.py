@@ -23,6 +23,7 @@ def rough(shape, dtype, seed=0, scale=0.1):
     return (np.round(heights * 2**20) / 2**20).astype(dtype)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("neighbours", [4, 8])
 def test_volume_is_kept_to_the_last_bit(dtype, neighbours):
     h = rough((24, 31), dtype)
@@ -61,6 +62,7 @@ def test_no_overshoot(dtype):
     assert float(s.max()) <= h.max()
 
 
+@pytest.mark.compiled
 def test_symmetries_hold_to_the_last_bit(dtype):
     h = rough((24, 24), dtype)
     scene = js.make_scene(h.shape, DX, ANGLE)
@@ -89,6 +91,7 @@ def test_height_and_spacing_scale_together():
     assert np.array_equal(8 * np.asarray(s), t)
 
 
+@pytest.mark.compiled
 def test_jit_equals_eager_and_vmap_equals_a_loop(dtype):
     maps = np.stack([rough((16, 16), dtype, seed) * (1 + seed) for seed in range(4)]).astype(dtype)
     scene = js.make_scene((16, 16), DX, ANGLE)
@@ -270,6 +273,7 @@ def test_cliffs_and_spikes_of_a_million_cells(dtype, height):
     assert int(s.outcome) in (0, js.Outcome.NOT_STILL)
 
 
+@pytest.mark.compiled
 def test_draining_keeps_account_of_every_quantum():
     h = np.full((49, 49), 1.0, "float32")
     s = js.settle(js.make_scene(h.shape, 1 / 49, ANGLE, edge=js.Draining(0.0)), h)

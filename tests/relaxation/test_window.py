@@ -23,6 +23,7 @@ def sand(window=None, **parts):
     return js.make_scene(SHAPE, DX, ANGLE, tool=js.Blade(0.02, 0.015, 0.0075), window=window, **parts)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     "sizes", [((6, 6), (56, 56)), pytest.param(((6, 6), (28, 28), (56, 56), (72, 80)), marks=pytest.mark.slow)]
 )
@@ -43,6 +44,7 @@ def test_equal_or_flagged(sizes):
         assert exact[size] == (12, 0)
 
 
+@pytest.mark.compiled
 def test_the_default_tolerance_keeps_the_difference_small():
     strokes = jnp.asarray(np.random.default_rng(1).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (8, 4)))
     whole = jax.vmap(lambda s: js.step(sand(js.Whole()), jnp.zeros(SHAPE), s).height)(strokes)

@@ -13,6 +13,8 @@ from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.terramechanics import scans
 from jaxsand.terramechanics import trench_experiment as rut
 
+pytestmark = pytest.mark.long
+
 FIXTURE = Path(__file__).parent / "synthetic_scans.csv"
 
 
