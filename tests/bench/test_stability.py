@@ -11,7 +11,6 @@ def wrong(rows):
     return "\n" + "\n".join(as_table([row for row in rows if not row["right"]] or rows[:1], "wrong"))
 
 
-@pytest.mark.compiled
 def test_hard_numbers():
     """By the default scheme; the slow test takes the others too."""
     rows = stability(64, 20, only=lambda c: isinstance(c.scheme, js.SuperTimeStepping) or "far below" in c.name)

@@ -20,6 +20,8 @@ from train.replay.her import Final, Future
 from train.runs import checkpoints, runs
 from train.runs.runs import learner_of, load, run
 
+pytestmark = pytest.mark.compiled  # as processes of their own are, with which they are compared
+
 STEPS = 40
 
 
