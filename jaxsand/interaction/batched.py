@@ -99,7 +99,8 @@ def value_and_grad_batch(
     """A loss of what each stroke of a batch leaves, and its gradient with respect to map and stroke, on every core.
 
     For each map it computes loss(step(scene, height, stroke).height, *args) and differentiates that. Call it from plain
-    Python only, not inside `jit`, `grad` or `vmap`, where `jax.value_and_grad` and `jax.vmap` do the same.
+    Python only, not inside `jit`, `grad` or `vmap`, where `jax.value_and_grad` and `jax.vmap` do the same, but without
+    marking what is not clean by NaN.
 
     Args:
         scene: the scene of all maps, with the tool.

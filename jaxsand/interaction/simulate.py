@@ -289,6 +289,8 @@ def _as_needed(
 
 def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
     """A settling window that holds the path and the blade's window at its ends; Whole() unless the map is much wider."""
+    if not path.size:
+        return Whole()
     far = float(np.max(np.ptp(np.asarray(path), axis=0))) / float(scene.grid.spacing)
     if isinstance(scheme, Multilevel) or not isinstance(scene.window, Window) or not far < max(scene.grid.shape):
         return Whole()

@@ -1,5 +1,7 @@
 """Paths of legs without lifting: corners, reversals, the carried heap."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
@@ -98,3 +100,11 @@ def test_a_rollout_is_steps_one_after_the_other():
     assert np.allclose(out.height[0], first.height, atol=1e-12)
     assert np.allclose(out.height[1], js.step(SAND, first.height, strokes[1]).height, atol=1e-9)
     assert out.sweeps.shape == (2,)
+
+
+def test_a_rollout_of_no_strokes_has_no_maps():
+    for side in (16, 32):
+        level, none = np.zeros((side, side)), np.zeros((0, 4))
+        bed = js.make_scene(level.shape, 0.01, tool=js.Blade())
+        assert js.rollout(bed, level, none).height.shape == (0, side, side)
+        assert jax.jit(partial(js.rollout, bed))(level, none).height.shape == (0, side, side)
