@@ -29,6 +29,14 @@ def number(text: str) -> float:
         raise argparse.ArgumentTypeError(f"got {text!r}, which is no number") from None
 
 
+def repose(text: str) -> float:
+    """An angle of repose in degrees."""
+    degrees = number(text)
+    if not 0 < degrees < 90:
+        raise argparse.ArgumentTypeError(f"got {text!r}; give degrees above 0 and below 90, such as 29")
+    return degrees
+
+
 def path_name(text: str) -> Path:
     if not text:
         raise argparse.ArgumentTypeError("got an empty name")

@@ -19,6 +19,7 @@ from jaxsand.cli.arguments import (
     neighbours,
     number,
     path_name,
+    repose,
     seed,
     width,
 )
@@ -94,7 +95,7 @@ def _settle(commands: Any) -> None:
     )
     p.add_argument("--out-file", type=path_name, required=True, metavar="OUT.npy")
     p.add_argument("--spacing", type=number, default=0.01, metavar="M", help="grid spacing in m (0.01)")
-    p.add_argument("--repose-deg", type=number, default=29.0, help="angle of repose (29)")
+    p.add_argument("--repose-deg", type=repose, default=29.0, help="angle of repose, in degrees (29)")
     p.add_argument("--neighbours", type=neighbours, choices=[4, 8, "isotropic"], default=8, help="4, 8 or isotropic (8)")
     p.add_argument("--scheme", choices=SCHEMES, default="super-time-stepping", help="relaxation: the paper's sweep")
     p.add_argument("--tol", type=number, default=1e-3, help="largest slope in excess of repose, a tangent (1e-3)")

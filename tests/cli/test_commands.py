@@ -114,7 +114,10 @@ BAD = {
         ["settle", "nan.npy", "--out-file", "x.npy"],
         "nan.npy: got 144 cells that are not finite; .*--no-data nan",
     ),
-    "right angle": (["settle", "pile.npy", "--out-file", "x.npy", "--repose-deg", "90"], "repose_angle: "),
+    "right angle": (
+        ["settle", "pile.npy", "--out-file", "x.npy", "--repose-deg", "90"],
+        "repose-deg: got '90'; give degrees",
+    ),
     "six neighbours": (["settle", "pile.npy", "--out-file", "x.npy", "--neighbours", "6"], "neighbours: invalid choice"),
     "spacing zero": (["settle", "pile.npy", "--out-file", "x.npy", "--spacing", "0"], "spacing: got 0.0"),
     "tolerance below zero": (["settle", "pile.npy", "--out-file", "x.npy", "--tol", "-1"], r"stop\.tolerance: got"),
