@@ -19,7 +19,7 @@ from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Multilevel, Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule
-from jaxsand.scene.scene import Scene, as_array, cast, fit
+from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import Pose
 from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
@@ -334,7 +334,7 @@ def check(result: Settled | Pushed) -> None:
 
     Raises:
         OutcomeError: the outcome of the result, or of any in a batch, is not 0; see `Outcome`.
-        ValueError: the result is being traced.
+        ValueError: the result is being traced, or is none.
 
     Example:
         >>> import jax.numpy as jnp
@@ -345,6 +345,8 @@ def check(result: Settled | Pushed) -> None:
             ...
         jaxsand.interaction.simulate.OutcomeError: the sand is not still (...
     """
+    if not isinstance(result, Settled | Pushed):
+        raise ValueError(f"result: got {type(result).__name__}; give what settle, step or another push returned")
     outcome = concrete(result.outcome)
     if outcome is None:
         raise ValueError("result: got a traced value; call check outside jit, vmap and grad")
@@ -376,6 +378,7 @@ def ready(
     scene: Scene, height: Float[ArrayLike, "H W"], push: PushRule | None, scheme: Scheme | None, stop: Stop | None
 ) -> tuple[Scene, Float[Array, "H W"], Rules]:
     """The checked arguments, with None replaced by defaults and every number cast to the height's dtype."""
+    check_scene(scene)
     push = SteppedPush() if push is None else push
     check_push(push)
     push.check(scene)

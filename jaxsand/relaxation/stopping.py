@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
-from jaxsand.scene.scene import Scene, as_array, check_window
+from jaxsand.scene.scene import Scene, as_array, check_scene, check_window
 from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
 
@@ -101,6 +101,7 @@ Stop = UntilStill | Sweeps
 
 def check_rule(scene: Scene, scheme: Scheme | None, stop: Stop | None) -> tuple[Scheme, Stop]:
     """The scheme and stop rule, with None replaced by SuperTimeStepping() and UntilStill(); ValueError if out of range."""
+    check_scene(scene)
     scheme = SuperTimeStepping() if scheme is None else scheme
     stop = UntilStill() if stop is None else stop
     _check_scheme(scene, scheme)

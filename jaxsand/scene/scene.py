@@ -166,6 +166,7 @@ def volume(scene: Scene, height: Float[ArrayLike, "H W"]) -> Float[Array, ""]:
 
 def fit(scene: Scene, height: Float[ArrayLike, "H W"]) -> tuple[Scene, Float[Array, "H W"]]:
     """The scene with every float cast to the height's dtype, and the height as an array; ValueError if it is unfit."""
+    check_scene(scene)
     height = as_array("height", height)
     if not jnp.issubdtype(height.dtype, jnp.floating):
         raise ValueError(f"height: got dtype {height.dtype}; convert it to float32 or float64 metres")
@@ -182,6 +183,12 @@ def fit(scene: Scene, height: Float[ArrayLike, "H W"]) -> tuple[Scene, Float[Arr
             f"spacing: got {scene.grid.spacing!r}, whose square is 0 in {height.dtype}; give metres, such as 0.01"
         )
     return cast(scene, height.dtype), height
+
+
+def check_scene(scene: object) -> None:
+    """Raises ValueError unless it is a scene."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene: got {type(scene).__name__}; give make_scene(shape, spacing)")
 
 
 def as_array(name: str, value: ArrayLike | npt.ArrayLike, dtype: DTypeLike | None = None) -> jax.Array:

@@ -108,3 +108,16 @@ def test_a_rollout_of_no_strokes_has_no_maps():
         bed = js.make_scene(level.shape, 0.01, tool=js.Blade())
         assert js.rollout(bed, level, none).height.shape == (0, side, side)
         assert jax.jit(partial(js.rollout, bed))(level, none).height.shape == (0, side, side)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda h, s: js.step(None, h, s), "scene: got NoneType; give make_scene"),
+        (lambda h, s: js.settle(None, h), "scene: got NoneType; give make_scene"),
+        (lambda h, s: js.check(h), "result: got ndarray; give what"),
+    ],
+)
+def test_what_is_no_scene_and_no_result_is_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(np.zeros((8, 8)), np.zeros(4))
