@@ -131,6 +131,8 @@ def test_a_recording_takes_no_more_memory_than_its_frames(monkeypatch):
         "many", "heights", "plan", scene, np.zeros((40, 40)), (to_and_fro, *[to_and_fro[:3]] * 40), True, 0.0
     )
 
+    monkeypatch.setattr(pipeline, "check", lambda _: None)  # what stands in for a push is no result
+
     def program(scene, points):
         def run(height, path):
             frames = np.zeros((points - 1, *height.shape), np.float32)
