@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.bench.rivals.plain import settle_numpy
-from jaxsand.bench.timing import race, seconds_of
+from jaxsand.bench.timing import seconds_of, timed
 from jaxsand.bench.work_precision import COLUMN, RIDGE, distance, trench
 from jaxsand.relaxation.flux import Nothing
 from jaxsand.relaxation.ghost_cells import at, halo, largest, prepare, quantum
@@ -103,7 +103,7 @@ def chunks(scene: Scene, heights: jax.Array, tell: Tell = quiet) -> list[dict[st
         many = len(heights)
 
         def rate(maps: jax.Array, chunk: int = chunk) -> float:
-            return len(maps) / race({"": partial(settle_batch, scene, maps, chunk=chunk)}, 5)[""].best
+            return len(maps) / timed(partial(settle_batch, scene, maps, chunk=chunk), 5).best
 
         row = {"name": f"chunks of {chunk}", "maps_per_second": rate(heights), "with_slow": rate(slow)}
         with _one_core():
@@ -145,13 +145,13 @@ def peer(batch: int = 256, tell: Tell = quiet) -> list[dict[str, Any]]:
     ]
     maps = jnp.broadcast_to(jnp.asarray(h), (batch, 60, 30))
     for name, scheme in (("settle_batch, paper's sweep", Relaxation()), ("settle_batch", None)):
-        timed = race({name: partial(settle_batch, scene, maps, scheme=scheme)}, 5)[name]
-        settled = timed.result
+        took = timed(partial(settle_batch, scene, maps, scheme=scheme), 5)
+        settled = took.result
         rows.append(
             {
                 "name": name,
                 "sweeps": int(settled.sweeps[0]),
-                "seconds": timed.best / batch,
+                "seconds": took.best / batch,
                 "error": distance(np.asarray(settled.height[0], float), end, h),
             }
         )

@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxsand.bench.timing import race
+from jaxsand.bench.timing import race, timed
 from jaxsand.envs import LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.stepped import SteppedPush
@@ -164,7 +164,7 @@ def _gymnasium(kind: str, options: dict[str, Any]) -> list[Contender]:
 
 
 def _raced(ways: list[Contender], tell: Tell) -> list[Row]:
-    timed = race({f"{way.kind}, {way.name}": way.call for way in ways}, _ROUNDS, tell)
+    times = race({f"{way.kind}, {way.name}": way.call for way in ways}, _ROUNDS, tell)
     return [
         {
             "kind": way.kind,
@@ -174,7 +174,7 @@ def _raced(ways: list[Contender], tell: Tell) -> list[Row]:
             "seconds": took.best,
             "compile_seconds": took.compile_seconds,
         }
-        for way, took in zip(ways, timed.values(), strict=True)
+        for way, took in zip(ways, times.values(), strict=True)
     ]
 
 
@@ -182,4 +182,4 @@ def _reset_seconds(env: Any, params: Any, batch: int) -> float:
     """Of one environment in a batch."""
     reset = jax.jit(jax.vmap(env.reset, (0, None)))
     keys = jax.random.split(jax.random.key(3), batch)
-    return race({"reset": partial(reset, keys, params)}, _ROUNDS)["reset"].best / batch
+    return timed(partial(reset, keys, params), _ROUNDS).best / batch

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.bench.timing import race
+from jaxsand.bench.timing import timed
 from jaxsand.goals.letters import letter_map
 from jaxsand.planning.binary.frontier import Bound, layered, misdug, two_colours
 from jaxsand.planning.binary.graph import Graph, goal_only, with_margin
@@ -31,9 +31,9 @@ def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[di
     rows = []
     for name, graph, bound in problems:
         tell(f"whole layers and a heap: {name}")
-        layers = race({name: partial(layered, graph, bound)}, repeats)[name]
+        layers = timed(partial(layered, graph, bound), repeats)
         heap = heap_misdug if bound is misdug else heap_two_colours
-        queue = race({name: partial(heap, graph)}, 3)[name]
+        queue = timed(partial(heap, graph), 3)
         seconds, heap_seconds, found, (steps, expanded) = layers.median, queue.median, layers.result, queue.result
         if found.steps != steps:
             raise RuntimeError(f"{name}: {found.steps} steps by layers, {steps} by the heap")

@@ -12,6 +12,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
+from jaxsand.interaction import blade_stepped
 from jaxsand.interaction._path import Pushed, Record
 from jaxsand.interaction.blade_stepped import with_near
 from jaxsand.interaction.rule import PushRule
@@ -364,8 +365,8 @@ def check(result: Settled | Pushed) -> None:
 
 
 def windows_for(scene: Scene, push: PushRule, times: float = 1) -> Iterator[Scene]:
-    """The scene with windows in which the push may do, each wider than the one before; see `SteppedPush.windows`."""
-    return push.windows(scene, times) if isinstance(push, SteppedPush) else iter(())
+    """The scene with windows in which the push may do, each wider than the one before; see blade_stepped.py."""
+    return blade_stepped.windows_for(scene, times) if isinstance(push, SteppedPush) else iter(())
 
 
 def check_push(push: object) -> None:

@@ -1,6 +1,5 @@
 """The push that advances by sub-steps and keeps the sand at rest around the tool: of a blade and of a wheel."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import jax
@@ -8,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed, Record
-from jaxsand.interaction.blade_stepped import push_along, windows_for
+from jaxsand.interaction.blade_stepped import push_along
 from jaxsand.interaction.wheel_stepped import roll_along
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.scene import Scene
@@ -66,7 +65,3 @@ class SteppedPush:
         """Moves the scene's tool along the path; see `PushRule`."""
         move = roll_along if isinstance(scene.tool, Wheel) else push_along
         return move(scene, height, path, self, record)
-
-    def windows(self, scene: Scene, times: float = 1) -> Iterator[Scene]:
-        """The scene with ever wider windows around its blade, from one that a stroke asks for; see `windows_for`."""
-        return windows_for(scene, times)

@@ -174,9 +174,8 @@ def experiment(
 
     Returns:
       The table: `rows`, and their means in `summary`, `by_beta_deg` and `by_sinkage_mm`; and the profiles by their source,
-        which
-      is a rule or a reference. Scans are aligned with the sections of each rule: `measured` has those aligned with the first
-      rule's, `measured-split` those aligned with a second one's.
+        which is a rule or a reference. Scans are aligned with the sections of each rule: `measured` has those aligned with
+        the first rule's, `measured-split` those aligned with a second one's.
     """
     known = references(TRENCHES)
     profiles: dict[str, dict[Trench, Profile]] = dict(known)

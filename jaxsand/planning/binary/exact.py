@@ -3,9 +3,8 @@
 The walk is a connected multigraph in which only its two ends have odd degree (Euler 1736). In each block it is closed, or
 open from the block's gate to where the walk goes on or ends, or, where both ends lie in or below the block, open between two
 of its cells (bound.py says why blocks do not interfere). So three figures are computed per block, from the leaves of the
-tree
-up: the cheapest closed walk; what it saves if one end lies in or below the block; what it saves if both do. The tree hangs
-from the start, or, where any start will do, from any cell.
+tree up: the cheapest closed walk; what it saves if one end lies in or below the block; what it saves if both do. The tree
+hangs from the start, or, where any start will do, from any cell.
 """
 
 from collections.abc import Callable
