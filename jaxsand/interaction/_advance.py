@@ -33,13 +33,14 @@ State = tuple[jax.Array, Fluxes, Stand]  # heights, fluxes, and how sand stood l
 @dataclass(frozen=True)
 class Ready:
     """Sand that is yet to come to rest: how it stands near the blade and in the block, at which rate it flows, its heights,
-    and a guess of what flows."""
+    a guess of what flows, and which share of a whole sub-step this one is."""
 
     near: Stand
     sand: Sand
     rate: jax.Array
     height: jax.Array
     guess: Fluxes
+    part: jax.Array
 
     def stand(self) -> Stand:
         return Stand(self.sand.gates, self.sand.open, self.sand.stretch)
@@ -51,11 +52,16 @@ class Step:
 
     block: Block
     tape: int = 32
+    keeps: bool = False  # whether fluxes are kept for a later leg
     trailing = True
 
     @property
     def together(self) -> int:
         return self.block.together
+
+    def kept(self, part: jax.Array, flux: Fluxes, before: Fluxes) -> Fluxes:
+        """The fluxes to start from after a sub-step that is the share `part` of a whole one, whose fluxes are `flux`."""
+        return tuple(f + (1 - part) * b for f, b in zip(flux, before, strict=True)) if self.keeps else flux
 
     def work(self, way: Way) -> jax.Array:
         """How far the step leads: what its number of repetitions grows with."""
@@ -87,7 +93,7 @@ class Advance(Step):
     lowered: bool = False
     rest: Rest = bring_to_rest
 
-    def arrived(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
+    def done(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
         gone = (k - int(self.lowered)).astype(way.length.dtype) * (self.chunk * self.substep)
         return (k >= int(self.lowered)) & jnp.all(gone >= way.length)
 
@@ -108,7 +114,7 @@ class Advance(Step):
             h, flux = self.rest(ready.sand, ready.rate, self.sweeps, ready.height, ready.guess)
             if gone is not None and lost is not None:
                 gone = gone + lost + flux[-1]
-            return (h, flux, ready.stand()), gone
+            return (h, self.kept(ready.part, flux, state[1]), ready.stand()), gone
 
         state = (old, flux, self.block.clear(view))
         (new, after, _), gone = lax.fori_loop(0, self.chunk, substep, (state, gone))
@@ -157,7 +163,7 @@ class Advance(Step):
         around = self.block.around(view, reach)
         sand = self.block.sand(way, view, clear, around)
         guess = self.block.guess(around.gates, jnp.where(moving, part, 0), flux)
-        return Ready(around, sand, rate * part, h, guess), lost
+        return Ready(around, sand, rate * part, h, guess, part), lost
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
         if isinstance(record, Moving):
@@ -214,7 +220,8 @@ class _Inside:
 
     def substep(self, floats: Any, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
         ready = self.ready(i, floats, rate, h, flux)
-        return bring_to_rest(ready.sand, ready.rate, self.advance.sweeps, ready.height, ready.guess)
+        h, new = bring_to_rest(ready.sand, ready.rate, self.advance.sweeps, ready.height, ready.guess)
+        return h, self.advance.kept(ready.part, new, flux)
 
     def pull(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Any, jax.Array, Fluxes]:
         """The cotangents of the floats, the heights and the fluxes: from the last sub-step backwards, made again."""
@@ -239,10 +246,11 @@ class _Inside:
                 pulled = jax.vjp(lambda *x: self.substep(x[0], x[1], i, *x[2:]), floats, rate, *state)[1]
                 df, dr, *of_state = pulled(of_state)
             else:
-                depends, pulled, sand = jax.vjp(partial(self._depends, i), floats, rate, *state, has_aux=True)
+                (depends, carried), pulled, sand = jax.vjp(partial(self._depends, i), floats, rate, *state, has_aux=True)
                 model = Links(sand, depends.rate)
                 steps = rest_taped(model, sweeps, depends.height, depends.guess, steps)
-                df, dr, *of_state = pulled(rest_pulled(model, sweeps, self.advance.block.part, steps, of_state))
+                rested = rest_pulled(model, sweeps, self.advance.block.part, steps, of_state)
+                df, dr, *of_state = pulled((rested, of_state[1] if carried else ()))
             return fetched(i - 1), jax.tree.map(jnp.add, of_floats, df), of_rate + dr, tuple(of_state), steps
 
         none = jax.tree.map(jnp.zeros_like, (floats, rate))
@@ -251,8 +259,11 @@ class _Inside:
         df, more = to_rate(of_rate)
         return jax.tree.map(jnp.add, of_floats, df), dh + more, dflux
 
-    def _depends(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[Rested, Sand]:
-        """What the sand's coming to rest depends on, and the sand."""
+    def _depends(
+        self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes
+    ) -> tuple[tuple[Rested, Fluxes], Sand]:
+        """What the sand's coming to rest depends on, the fluxes that are kept beside its own, and the sand."""
         ready = self.ready(i, floats, rate, h, flux)
         near, sand = ready.near, ready.sand
-        return Rested(near.gates, near.stretch, sand.bottom, sand.drop, ready.rate, ready.height, ready.guess), sand
+        rested = Rested(near.gates, near.stretch, sand.bottom, sand.drop, ready.rate, ready.height, ready.guess)
+        return (rested, tuple((1 - ready.part) * f for f in flux) if self.advance.keeps else ()), sand

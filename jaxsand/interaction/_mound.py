@@ -41,7 +41,7 @@ def beyond(m: jax.Array, dx: jax.Array) -> jax.Array:
 def distance(a: jax.Array, b: jax.Array) -> jax.Array:
     """sqrt(a^2 + b^2), with a derivative at 0."""
     square = a * a + b * b
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, jnp.finfo(square.dtype).tiny)), 0)
 
 
 def heights(where: Lean, reach: jax.Array, dx: jax.Array) -> jax.Array:

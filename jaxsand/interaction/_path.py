@@ -59,7 +59,8 @@ class Pushed:
     pose: Pose
 
 
-State = tuple[jax.Array, Lost, jax.Array]  # height, height lost over the rim, movement at the window's edge
+# height, height lost over the rim, movement at the window's edge, and what a rule keeps from leg to leg: () before the first
+State = tuple[jax.Array, Lost, jax.Array, Tree]
 Leg = Callable[[Job, Pose, jax.Array, Pose | None, State], State]
 Record = Callable[[jax.Array], Tree]  # what to note of the height [H, W] (m) after each leg
 
@@ -102,7 +103,7 @@ def along_legs(
     moved = jnp.zeros_like(bottom)
     if isinstance(scene.window, Window):
         moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
-    state: State = (intact, lost, moved)
+    state: State = (intact, lost, moved, ())
 
     pose, length = _heading(path[0], path[1], None)
     state = leg(job, pose, length, None, state)
@@ -120,7 +121,7 @@ def along_legs(
             frames = jax.tree.map(lambda first, more: jnp.concatenate([first[None], more]), frames[0], rest)
     elif record:
         frames = jax.tree.map(lambda first: first[None], frames[0])
-    marked, lost, moved = state
+    marked, lost, moved, _ = state
     edge = jnp.zeros((), bool)
     if isinstance(scene.window, Window):
         edge = moved > scene.window.tolerance

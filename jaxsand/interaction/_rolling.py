@@ -25,7 +25,15 @@ Carried = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was los
 
 
 @dataclass(frozen=True)
-class Touchdown(Step):
+class _OfWheel(Step):
+    """A step whose params are a wheel's track."""
+
+    def work(self, way: Any) -> jax.Array:
+        return super().work(way.way)
+
+
+@dataclass(frozen=True)
+class Touchdown(_OfWheel):
     """The step in which the wheel comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1
@@ -63,7 +71,7 @@ def _at_rest(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
 
 
 @dataclass(frozen=True)
-class _Moved(Step):
+class _Moved(_OfWheel):
     """A step in which the wheel moves, and `sweeps` proximal steps after each sub-step bring the sand to rest around it."""
 
     substep: float = 0.125
@@ -84,15 +92,15 @@ class _Moved(Step):
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
         around, among = wheel.around(self.block, track, view, now, h)
         guess = self.block.guess(around.gates, among * part, flux)
-        h, flux = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
-        return h, flux, None if gone is None else gone + flux[-1]
+        h, new = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
+        return h, self.kept(part, new, flux), None if gone is None else gone + new[-1]
 
 
 @dataclass(frozen=True)
 class Turn(_Moved):
     """A sub-step of a turn in place, which moves the wheel's corners by `substep` spacings."""
 
-    def turned(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
+    def done(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
         """Whether the turn is complete before step k."""
         return jnp.all(k.astype(track.way.angle.dtype) * self._part(track) >= jnp.abs(track.way.angle))
 
@@ -130,7 +138,7 @@ class Roll(_Moved):
     chunk: int = 8
     lowered: bool = False
 
-    def arrived(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
+    def done(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
         """Whether the leg is complete before step k."""
         steps = (k - int(self.lowered)).astype(track.way.length.dtype)
         return (k >= int(self.lowered)) & jnp.all(steps * (self.chunk * self.substep) >= track.way.length)

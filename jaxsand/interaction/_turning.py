@@ -24,7 +24,7 @@ class Turn(Step):
     sweeps: int = 4
     rest: Rest = bring_to_rest
 
-    def turned(self, way: Way, k: jax.Array, _: Moving) -> jax.Array:
+    def done(self, way: Way, k: jax.Array, _: Moving) -> jax.Array:
         """Whether the turn is complete before step k."""
         return jnp.all(k.astype(way.angle.dtype) * self._part(way) >= jnp.abs(way.angle))
 
@@ -55,6 +55,7 @@ class Turn(Step):
         guess = self.block.guess(near.gates, part, sand.flux)
         new, flux = self.rest(around, way.rate * among * part, self.sweeps, h, guess)
         gone = None if lost is None else lost + flux[-1]
+        flux = self.kept(part, flux, sand.flux)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))
         return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
 

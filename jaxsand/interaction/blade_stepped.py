@@ -23,14 +23,15 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
+from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._advance import Advance, Rest
-from jaxsand.interaction._block import SPARE, Block, Moving, Way
+from jaxsand.interaction._block import SPARE, Block, Way
 from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._leg import Steps, chunk, moved
 from jaxsand.interaction._lowering import Lower
-from jaxsand.interaction._path import Pushed, Record, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._path import Pushed, Record, State, along_legs
 from jaxsand.interaction._turning import Turn
-from jaxsand.interaction.resting import bring_to_rest, no_flux
+from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, Pose
 from jaxsand.scene.validation import concrete
@@ -56,7 +57,7 @@ def push_along(
     """
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        return _leg(scene, push, rest, job, pose, length, before, state)
+        return _leg(scene, push, rest, path.shape[0] > 2, job, pose, length, before, state)
 
     return along_legs(scene, height, path, push.rate, leg, record)
 
@@ -65,26 +66,24 @@ def _leg(
     scene: Scene,
     push: "SteppedPush",
     rest: Rest,
+    keeps: bool,
     job: Job,
     pose: Pose,
     length: jax.Array,
     before: Pose | None,
     state: State,
 ) -> State:
-    """Lowers the blade, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
-    shape, dx, drains = scene.grid.shape, job.bed.spacing, job.bed.rim is not None
+    """Lowers the blade, or turns it from the pose before, and moves it ahead by `length` (m); see `moved`."""
+    shape, dx, substep = scene.grid.shape, job.bed.spacing, push.substep
     size = near = max(shape)
     if isinstance(scene.window, Window) and max(scene.window.size) < size:
         size = max(scene.window.size)
         near = min(size, scene.window.near or size)
-    block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, drains)
-    h, lost, moved = state
+    block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, job.bed.rim is not None)
     if near < size:  # a traced blade may be larger than the one for which the window was made
+        h, lost, edge, kept = state
         far = lax.stop_gradient(_far(job.tool.width / dx, job.tool.thickness / dx))
-        moved = jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, moved)
-    none = no_flux(block.neighbours, drains, jnp.zeros((size, size), h.dtype))
-    flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
-    sand = Moving(flat, gone, none, moved)
+        state = h, lost, jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, edge), kept
 
     def way(pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
         drop = job.bed.drop
@@ -102,24 +101,24 @@ def _leg(
             angle,
         )
 
-    zero = jnp.zeros_like(length)
-    if before is None:
-        sand = repeat(Lower(block), 1, way(pose, zero, zero), sand)
-    else:
-        angle = turn_between(before, pose)
-        turn = way(Pose(pose.x, pose.y, before.cos, before.sin), zero, angle)
-        bound = math.ceil(math.pi * math.hypot(*shape) / push.substep) + 1
-        turning = Turn(block, substep=push.substep, sweeps=push.sweeps, rest=rest)
-        sand, _ = repeat_until(turning.turned, turning, bound, turn, sand)
-    start, onmap = over_the_map(scene, job, pose, length)
-    # make_scene holds the thickness below the map's diagonal, so twice the diagonal is enough.
-    chunk = max(1, int(1 / push.substep))
-    bound = math.ceil((2 * math.hypot(*shape) + 3) / (push.substep * chunk)) + 1
-    lowered = before is None
-    advance = Advance(block, substep=push.substep, sweeps=push.sweeps, chunk=chunk, lowered=lowered, rest=rest)
-    sand, _ = repeat_until(advance.arrived, advance, bound, way(start, onmap, zero), replace(sand, flux=none))
-    h, lost = jax.tree.map(lambda x: x.reshape(shape), (sand.height, sand.lost))
-    return h, lost, sand.edge
+    steps = Steps(
+        block,
+        Lower(block),
+        Turn(block, substep=substep, sweeps=push.sweeps, rest=rest, keeps=keeps),
+        Advance(
+            block,
+            substep=substep,
+            sweeps=push.sweeps,
+            chunk=chunk(substep),
+            lowered=before is None,
+            rest=rest,
+            keeps=keeps,
+        ),
+        substep,
+        2 * math.hypot(*shape) + 3,  # make_scene holds the thickness below the map's diagonal
+        keeps,
+    )
+    return moved(scene, job, steps, way, pose, length, before, state)
 
 
 def with_near(scene: Scene) -> Scene:

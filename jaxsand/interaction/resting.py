@@ -31,7 +31,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.interaction.stencil import both_ends, inner, net, outer, rises
-from jaxsand.relaxation.flux import Fluxes, ends
+from jaxsand.relaxation.flux import Fluxes, ends, share_beyond
 from jaxsand.relaxation.ghost_cells import nearest, truncate
 from jaxsand.scene.grid import Neighbours, links
 
@@ -152,9 +152,7 @@ class _Gradients:
             i, j = n // 2, n % 2
             rate = self.rate * jnp.minimum(of_x[i], of_y[j])
             zx, zy = y[2 * n] + rate * across[i], y[2 * n + 1] + rate * up[j]
-            square, least = zx * zx + zy * zy, rate * self.sand.drop
-            beyond = square > least * least
-            part = jnp.where(beyond, 1 - least / jnp.sqrt(jnp.where(beyond, square, 1)), 0)
+            part = share_beyond(zx * zx + zy * zy, rate * self.sand.drop)
             out += [zx * part, zy * part]
         if self.sand.sides is not None:
             out.append(_over(self.sand, self.rate, y[-1], inner(around)))

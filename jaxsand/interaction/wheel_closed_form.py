@@ -75,8 +75,8 @@ def push_split(
     scene = replace(scene, window=Whole())
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        h, lost, moved = state
-        return _pass(scene, job, pose, length, h), lost, moved
+        h, *rest = state
+        return _pass(scene, job, pose, length, h), *rest
 
     return along_legs(scene, height, path, 0.125, leg, record)
 

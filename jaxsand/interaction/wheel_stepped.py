@@ -15,20 +15,20 @@ repose and above its complement the two agree.
 """
 
 import math
-from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
-from jaxsand.interaction._block import Block, Moving, Way
+from jaxsand.autodiff.while_loop import Tree
+from jaxsand.interaction._block import Block, Way
 from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._path import Pushed, Record, State, along_legs, over_the_map, turn_between
+from jaxsand.interaction._leg import Steps, chunk, moved
+from jaxsand.interaction._path import Pushed, Record, State, along_legs
 from jaxsand.interaction._rolling import Roll, Touchdown, Turn
 from jaxsand.interaction._wheel import Track
-from jaxsand.interaction.resting import no_flux
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, Smooth, carried_area, half_chord
 from jaxsand.scene.window import Window
@@ -43,42 +43,37 @@ def roll_along(
     """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        return _leg(scene, push, job, pose, length, before, state)
+        return _leg(scene, push, path.shape[0] > 2, job, pose, length, before, state)
 
     return along_legs(scene, height, path, push.rate, leg, record)
 
 
 def _leg(
-    scene: Scene, push: "SteppedPush", job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State
+    scene: Scene,
+    push: "SteppedPush",
+    keeps: bool,
+    job: Job,
+    pose: Pose,
+    length: jax.Array,
+    before: Pose | None,
+    state: State,
 ) -> State:
-    """Lowers the wheel, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
-    shape, drains = scene.grid.shape, job.bed.rim is not None
+    """Lowers the wheel, or turns it from the pose before, and moves it ahead by `length` (m); see `moved`."""
+    shape, substep, sweeps = scene.grid.shape, push.substep, push.sweeps
     size = max(shape)
     if isinstance(scene.window, Window):
         size = min(size, max(scene.window.size))
-    block = Block(shape, size, size, size < max(shape), scene.grid.neighbours, drains)
-    h, lost, moved = state
-    none = no_flux(block.neighbours, drains, jnp.zeros((size, size), h.dtype))
-    flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
-    sand = Moving(flat, gone, none, moved)
-    zero = jnp.zeros_like(length)
-    if before is None:
-        sand = repeat(Touchdown(block), 1, _track(job, pose, zero, zero), sand)
-    else:
-        angle = turn_between(before, pose)
-        turn = Turn(block, substep=push.substep, sweeps=push.sweeps)
-        bound = math.ceil(math.pi * math.hypot(*shape) / push.substep) + 1
-        turned = _track(job, Pose(pose.x, pose.y, before.cos, before.sin), zero, angle)
-        sand, _ = repeat_until(turn.turned, turn, bound, turned, sand)
-    start, onmap = over_the_map(scene, job, pose, length)
-    chunk = max(1, int(1 / push.substep))
-    # make_scene holds radius and width below the map's diagonal, so four times that is enough.
-    bound = math.ceil((4 * math.hypot(*shape) + 3) / (push.substep * chunk)) + 1
-    roll = Roll(block, substep=push.substep, sweeps=push.sweeps, chunk=chunk, lowered=before is None)
-    track = _track(job, start, onmap, zero)
-    sand, _ = repeat_until(roll.arrived, roll, bound, track, replace(sand, flux=none))
-    h, lost = jax.tree.map(lambda x: x.reshape(shape), (sand.height, sand.lost))
-    return h, lost, sand.edge
+    block = Block(shape, size, size, size < max(shape), scene.grid.neighbours, job.bed.rim is not None)
+    steps = Steps(
+        block,
+        Touchdown(block),
+        Turn(block, substep=substep, sweeps=sweeps, keeps=keeps),
+        Roll(block, substep=substep, sweeps=sweeps, chunk=chunk(substep), lowered=before is None, keeps=keeps),
+        substep,
+        4 * math.hypot(*shape) + 3,  # make_scene holds radius and width below the map's diagonal
+        keeps,
+    )
+    return moved(scene, job, steps, partial(_track, job), pose, length, before, state)
 
 
 def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:

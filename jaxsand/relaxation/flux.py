@@ -215,8 +215,8 @@ def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Ar
     else:
         x, y = _steps(u)
         for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
-            along_x = jnp.abs(gx) * ox * _yielding(gx * gx + oy * gy * gy, m)
-            along_y = jnp.abs(gy) * oy * _yielding(ox * gx * gx + gy * gy, m)
+            along_x = jnp.abs(gx) * ox * share_beyond(gx * gx + oy * gy * gy, m)
+            along_y = jnp.abs(gy) * oy * share_beyond(ox * gx * gx + gy * gy, m)
             e = jnp.sqrt(gx * gx + gy * gy) - m  # in whole cells at most sqrt(2) times the larger
             yield jnp.minimum(e, math.sqrt(2) * jnp.maximum(along_x, along_y)) * bed.spacing
 
@@ -233,13 +233,13 @@ def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
     weights = []
     if gate is None:
         for gx, gy, m in _triangles(bed, x / bed.spacing, y / bed.spacing):
-            w = _yielding(gx * gx + gy * gy, m)
+            w = share_beyond(gx * gx + gy * gy, m)
             weights.append((w, w))
         opening = None
     else:  # in the gradient of one link the other link counts as far as it is open
         opening = tuple(jnp.minimum(*ends(gate, di, dj)) for di, dj, _ in links(4))
         for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
-            weights.append((_yielding(gx * gx + oy * gy * gy, m), _yielding(ox * gx * gx + gy * gy, m)))
+            weights.append((share_beyond(gx * gx + oy * gy * gy, m), share_beyond(ox * gx * gx + gy * gy, m)))
     (ww, sw), (wn, nw), (es, se), (en, ne) = weights  # by the arm along x (west, east), then along y (south, north)
     west, east, south, north = lax.optimization_barrier((ww + wn, es + en, sw + se, nw + ne))
     column, row = jnp.zeros_like(west[:, :1]), jnp.zeros_like(west[:1])
@@ -248,10 +248,15 @@ def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
     return (over_x, over_y) if opening is None else (over_x * opening[0], over_y * opening[1])
 
 
-def _yielding(square: jax.Array, m: jax.Array) -> jax.Array:
-    """max(1 - m / |g|, 0) for |g|^2 = square."""
-    steep = square > m * m
-    return jnp.where(steep, 1 - m / jnp.sqrt(jnp.where(steep, square, 1)), 0)
+def share_beyond(square: jax.Array, m: jax.Array) -> jax.Array:
+    """The share of a vector g that lies beyond the length m, max(1 - m / |g|, 0) for |g|^2 = square.
+
+    A compiler may compute `square` anew for each use and round it differently. So where one use says that it is above m^2
+    and another that it is not, the share must still be about 0: the length that is divided by is never below m.
+    """
+    least = m * m
+    size = jnp.sqrt(jnp.where(square > least, square, least + jnp.finfo(square.dtype).tiny))
+    return jnp.where(square > least, 1 - m / size, 0)
 
 
 def _steps(u: jax.Array) -> tuple[jax.Array, jax.Array]:

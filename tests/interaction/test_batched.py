@@ -52,6 +52,15 @@ def test_acting_leaves_the_sand_as_the_tool_did():
     assert np.allclose(found, want, atol=1e-12)
 
 
+def test_wheels_are_sorted_by_their_way_too():
+    """More wheels than are computed together once ended in an error."""
+    sand = js.make_scene((24, 24), 0.01, 0.5, tool=js.Wheel())
+    strokes = np.random.default_rng(1).uniform(0.04, 0.2, (17, 4))
+    found = np.asarray(js.step_batch(sand, np.zeros((17, 24, 24)), strokes, chunk=32, **QUICK).height)
+    for k in (0, 16):
+        assert np.allclose(found[k], js.step(sand, np.zeros((24, 24)), strokes[k], **QUICK).height, atol=1e-12)
+
+
 def test_large_maps_are_pushed_in_windows_and_again_where_these_are_too_small():
     """A window made for the blade alone does not hold the heap of a deep map of ridges; the results are the whole map's."""
     sand = js.make_scene((40, 40), 0.01, 0.5, tool=js.Blade())

@@ -1,0 +1,128 @@
+"""One leg of a tool that moves in sub-steps, blades and wheels alike: it is lowered or turns in place, then moves ahead."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
+from jaxsand.interaction._advance import Step
+from jaxsand.interaction._block import Block, Moving
+from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._frame import Frame, frame_of
+from jaxsand.interaction._kept import Kept, Laid, lay, seen
+from jaxsand.interaction._path import State, over_the_map, turn_between
+from jaxsand.interaction.resting import no_flux
+from jaxsand.relaxation.flux import Fluxes
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Pose, reach
+
+
+class Loop(Protocol):
+    """A step that is repeated until it is done."""
+
+    def done(self, params: Any, k: jax.Array, state: Moving) -> jax.Array: ...
+
+    def __call__(self, params: Any, k: jax.Array, sand: Moving) -> Moving: ...
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What a tool does on a leg.
+
+    Attributes:
+        block: the part of the map that is computed.
+        lower: the step in which the tool comes down.
+        turn: a sub-step of a turn in place.
+        ahead: the sub-steps ahead within a spacing.
+        substep: length of a sub-step (spacings).
+        bound: largest length of a leg (spacings).
+        keeps: whether another leg follows.
+    """
+
+    block: Block
+    lower: Step
+    turn: Any
+    ahead: Any
+    substep: float
+    bound: float
+    keeps: bool
+
+
+Params = Callable[[Pose, jax.Array, jax.Array], Tree]  # of a pose, the length of a leg (m) and the angle before it (rad)
+
+
+def chunk(substep: float) -> int:
+    """The number of sub-steps within a spacing."""
+    return max(1, int(1 / substep))
+
+
+def moved(
+    scene: Scene, job: Job, steps: Steps, params: Params, pose: Pose, length: jax.Array, before: Pose | None, state: State
+) -> State:
+    """Lowers the tool, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
+    shape, dx, block = scene.grid.shape, job.bed.spacing, steps.block
+    h, lost, edge, kept = state
+    none = no_flux(block.neighbours, block.drains, jnp.zeros((block.size, block.size), h.dtype))
+    flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
+    sand = Moving(flat, gone, none, edge)
+    zero = jnp.zeros_like(length)
+    nowhere = Laid(none, jnp.int32(0), jnp.int32(0))
+    if before is None:
+        sand = repeat(steps.lower, 1, params(pose, zero, zero), sand)
+        kept = Kept(nowhere, nowhere, zero, zero)
+    else:
+        assert isinstance(kept, Kept)
+        sand, kept = _turned(job, steps, params, shape, pose, before, kept, sand)
+    start, onmap = over_the_map(scene, job, pose, length)
+    stride = chunk(steps.substep) * steps.substep
+    bound = math.ceil(steps.bound / stride) + 1
+    frame = frame_of(shape, _in_spacings(start, dx))
+
+    def first(step: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return block.ahead(frame, onmap / dx, step, stride)[0]
+
+    flux = none
+    if before is not None:
+        alike = jnp.clip(before.cos * pose.cos + before.sin * pose.sin, 0, 1)
+        flux = _times(alike, seen(block, frame, first(jnp.int32(0)), kept.ahead))
+    sand, count = repeat_until(steps.ahead.done, steps.ahead, bound, params(start, onmap, zero), replace(sand, flux=flux))
+    if steps.keeps:
+        last = count - 1 - int(before is None)
+        kept = replace(kept, ahead=lay(block, frame, first(last), sand.flux), since=kept.since + length / dx)
+    h, lost = jax.tree.map(lambda x: x.reshape(shape), (sand.height, sand.lost))
+    return h, lost, sand.edge, kept
+
+
+def _turned(
+    job: Job, steps: Steps, params: Params, shape: tuple[int, int], pose: Pose, before: Pose, kept: Kept, sand: Moving
+) -> tuple[Moving, Kept]:
+    """Turns the tool in place from the pose before."""
+    dx, no = job.bed.spacing, jnp.zeros((), bool)
+    angle = turn_between(before, pose)
+    frame = Frame(_in_spacings(replace(before, x=pose.x, y=pose.y), dx), no, no, no, shape)
+    first = steps.block.corner(frame.pose.x, frame.pose.y)
+    sense = jnp.sign(angle)
+    alike = jnp.where(sense * kept.sense < 0, 0, jnp.clip(1 - kept.since * dx / reach(job.tool), 0, 1))
+    flux = _times(alike, seen(steps.block, frame, first, kept.turned))
+    turn = params(Pose(pose.x, pose.y, before.cos, before.sin), jnp.zeros_like(angle), angle)
+    bound = math.ceil(math.pi * math.hypot(*shape) / steps.substep) + 1
+    sand, _ = repeat_until(steps.turn.done, steps.turn, bound, turn, replace(sand, flux=flux))
+    turns = sense != 0
+    return sand, replace(
+        kept,
+        turned=lay(steps.block, frame, first, sand.flux),
+        sense=jnp.where(turns, sense, kept.sense),
+        since=jnp.where(turns, 0, kept.since),
+    )
+
+
+def _times(factor: jax.Array, flux: Fluxes) -> Fluxes:
+    return tuple(factor * f for f in flux)
+
+
+def _in_spacings(pose: Pose, dx: jax.Array) -> Pose:
+    return Pose(pose.x / dx, pose.y / dx, pose.cos, pose.sin)
