@@ -30,7 +30,7 @@ from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import truncate
 from jaxsand.relaxation.settling import settle, settle_batch
-from jaxsand.scene.grid import links
+from jaxsand.scene.grid import Neighbours, links
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, cast, fit, make_scene
 from jaxsand.scene.tools import Blade
@@ -230,8 +230,44 @@ def long_path(sides: tuple[int, ...] = (64, 4096), legs: int = 100, tell: Tell =
     return rows
 
 
+def in_parts(tell: Tell = quiet) -> list[dict[str, Any]]:
+    """How far a path in many legs is from the same path in one, over what that changes: a line of 16 cm askew to the cells
+    by the default blade, and half a turn of a blade of 10 cells all but in place."""
+    rows = []
+    headings = {legs: math.pi * np.arange(legs + 1) / legs for legs in (1, 4, 16)}
+    turns = {
+        legs: 0.16 + 1e-5 * np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([np.cos(a), np.sin(a)], 1), 0)])
+        for legs, a in headings.items()
+    }
+    start, stop = np.array([0.086, 0.129]), np.array([0.234, 0.191])
+    lines = {legs: np.linspace(start, stop, legs + 1) for legs in (1, 4, 16, 64)}
+    kinds: list[tuple[str, Blade, dict[int, np.ndarray]]] = [
+        ("line", Blade(), lines),
+        ("half turn", Blade(width=0.1, thickness=0.015, depth=0.0075), turns),
+    ]
+    every: tuple[Neighbours, ...] = (4, 8, "isotropic")
+    for name, blade, paths in kinds:
+        for neighbours in every:
+            tell(f"{name} in parts, neighbours {neighbours}")
+            scene, level = make_scene((32, 32), 0.01, _ANGLE, neighbours, tool=blade), np.zeros((32, 32), np.float32)
+            one, *others = (np.asarray(follow(scene, level, path).height) for path in paths.values())
+            rows += [
+                {
+                    "path": name,
+                    "neighbours": neighbours,
+                    "legs": n,
+                    "apart": float(np.abs(h - one).sum() / np.abs(one).sum()),
+                }
+                for n, h in zip(list(paths)[1:], others, strict=True)
+            ]
+    return rows
+
+
 def heaps(
-    spacings_mm: tuple[float, ...] = (10, 5, 2.5, 1.25), push: SteppedPush | None = None, tell: Tell = quiet
+    spacings_mm: tuple[float, ...] = (10, 5, 2.5, 1.25),
+    push: SteppedPush | None = None,
+    tell: Tell = quiet,
+    neighbours: Neighbours = 8,
 ) -> list[dict[str, Any]]:
     """The heap ahead of a blade as wide as its bed, against the triangle: 20 mm thick, 12 mm deep, 16 cm far, 31 degrees.
 
@@ -240,8 +276,8 @@ def heaps(
     """
     rows = []
     for dx in spacings_mm:
-        tell(f"heap on cells of {dx:g} mm")
-        rows.append(heap(dx / 1000, SteppedPush() if push is None else push))
+        tell(f"heap on cells of {dx:g} mm, neighbours {neighbours}")
+        rows.append(heap(dx / 1000, SteppedPush() if push is None else push, neighbours=neighbours))
     return rows
 
 
@@ -253,6 +289,7 @@ def heap(
     way: float = 0.16,
     angle: float = math.radians(31),
     thickness: float = 0.02,
+    neighbours: Neighbours = 8,
 ) -> dict[str, Any]:
     """One heap (lengths in m): V = depth (way + thickness / 2) to a unit of width, peak sqrt(2 mu V), toe sqrt(2 V / mu)."""
     mu = math.tan(angle)
@@ -260,7 +297,7 @@ def heap(
     peak, toe = math.sqrt(2 * mu * volume), math.sqrt(2 * volume / mu)
     margin = 2 * thickness + math.sqrt(depth * thickness / mu)
     columns = math.ceil((2 * margin + way + 1.3 * toe) / dx)
-    scene = make_scene((3, columns), dx, angle, tool=Blade(columns * dx, thickness, depth))
+    scene = make_scene((3, columns), dx, angle, neighbours, tool=Blade(columns * dx, thickness, depth))
     path = np.array([[margin, 1.5 * dx], [margin + way, 1.5 * dx]])
     _, frames = follow_frames(scene, np.zeros((3, columns), np.float32), path, push=push)
     h = np.asarray(frames[-1][1], float)
@@ -269,6 +306,7 @@ def heap(
     exact = np.diff(inside * peak - mu * inside**2 / 2) / dx
     ahead = edges[:-1] >= -1e-6 * dx
     return {
+        "neighbours": neighbours,
         "spacing_mm": 1000 * dx,
         "toe_cells": toe / dx,
         "error": float(np.abs(h - exact)[ahead].sum() * dx / volume),

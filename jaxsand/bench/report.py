@@ -86,7 +86,8 @@ def bench(
         report["push"] = pushes.push_speed(max(1, batch // 4), tell)
         if grids:
             report["push_precision"] = pushes.push_precision(max(1, batch // 256), tell)
-            report["push_heaps"] = pushes.heaps(tell=tell)
+            report["push_heaps"] = pushes.heaps(tell=tell) + pushes.heaps((10, 5, 2.5), tell=tell, neighbours="isotropic")
+            report["push_in_parts"] = pushes.in_parts(tell)
             report["push_by_spacing"] = pushes.push_against_spacing(tell)
             report["push_by_heading"] = pushes.push_by_heading(tell)
             report["push_continuity"] = pushes.push_continuity(tell=tell)

@@ -50,9 +50,16 @@ def test_c_equals_jaxsand():
         settle_c(maps.astype(float), DX, MU)
 
 
-def test_the_benchmark_of_settling_reports_rates_that_fit_together(monkeypatch):
-    monkeypatch.setattr(benchmark, "_ROUNDS", 1)
-    report = benchmark.bench("settle", batch=16, grids=0)
+def test_the_benchmark_of_settling_reports_rates_that_fit_together():
+    check_rates({"machine": "", "batch": 2, "map": [32, 32], "settle": benchmark.bench_settle(2)})
+
+
+@pytest.mark.slow
+def test_the_whole_benchmark_of_settling_does_too():
+    check_rates(benchmark.bench("settle", batch=16, grids=0))
+
+
+def check_rates(report):
     cells = math.prod(report["map"])
     for row in report["settle"]:
         assert row["maps_per_second"] == pytest.approx(1e9 / (row["ns_per_cell_sweep"] * row["sweeps"] * cells), rel=0.01)

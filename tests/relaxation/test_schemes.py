@@ -222,6 +222,7 @@ def test_gradients_agree_with_differences(scheme, neighbours):
         assert float(jnp.sum(slope * way)) == pytest.approx(float(difference), rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.long
 def test_an_isotropic_pile_converges_to_the_cone():
     sides = np.array([33, 65, 129])
     errors, maps = zip(*(piles.cone(n) for n in sides), strict=True)
