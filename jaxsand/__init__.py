@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from jaxsand.interaction.batched import step_batch as step_batch
     from jaxsand.interaction.batched import value_and_grad_batch as value_and_grad_batch
     from jaxsand.interaction.blade_closed_form import SwathPush as SwathPush
+    from jaxsand.interaction.outcome import OutcomeError as OutcomeError
+    from jaxsand.interaction.outcome import check as check
     from jaxsand.interaction.rule import PushRule as PushRule
-    from jaxsand.interaction.simulate import OutcomeError as OutcomeError
     from jaxsand.interaction.simulate import Shaped as Shaped
     from jaxsand.interaction.simulate import act as act
-    from jaxsand.interaction.simulate import check as check
     from jaxsand.interaction.simulate import follow as follow
     from jaxsand.interaction.simulate import follow_frames as follow_frames
     from jaxsand.interaction.simulate import rollout as rollout
@@ -97,7 +97,7 @@ _HOMES = {
     "Open": "scene.boundaries",
     "Optimised": "planning.gradient",
     "Outcome": "relaxation.stopping",
-    "OutcomeError": "interaction.simulate",
+    "OutcomeError": "interaction.outcome",
     "Pairwise": "relaxation.schemes",
     "Plan": "planning.binary",
     "Pose": "scene.tools",
@@ -128,7 +128,7 @@ _HOMES = {
     "act": "interaction.simulate",
     "calibrate": "terramechanics.calibration",
     "calibrate_sections": "terramechanics.sections",
-    "check": "interaction.simulate",
+    "check": "interaction.outcome",
     "follow": "interaction.simulate",
     "follow_frames": "interaction.simulate",
     "make": "envs",

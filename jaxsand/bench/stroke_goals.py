@@ -9,7 +9,8 @@ import numpy as np
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics
 from jaxsand.goals.surfaces import terrain_surface
-from jaxsand.interaction.simulate import check, rollout
+from jaxsand.interaction.outcome import check
+from jaxsand.interaction.simulate import rollout
 from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill

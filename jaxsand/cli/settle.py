@@ -26,7 +26,7 @@ def run_settle(options: argparse.Namespace) -> None:
     elif heights.dtype.kind != "f":
         heights = heights.astype(np.float32)
     from jaxsand.goals.metrics import volume_error
-    from jaxsand.interaction.simulate import OutcomeError, check
+    from jaxsand.interaction.outcome import OutcomeError, check
     from jaxsand.relaxation import schemes
     from jaxsand.relaxation.settling import settle
     from jaxsand.relaxation.stopping import Outcome, UntilStill

@@ -14,7 +14,7 @@ from jaxsand.envs.pushing import Pushing
 from jaxsand.goals import metrics
 from jaxsand.goals.letters import stroke_list
 from jaxsand.goals.surfaces import rough_surface
-from jaxsand.interaction.simulate import check
+from jaxsand.interaction.outcome import check
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.masked import gaps

@@ -22,7 +22,6 @@ from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import Pose
-from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
 
 Rules = tuple[PushRule, Scheme, Stop]
@@ -298,70 +297,6 @@ def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
     size = 1 << math.ceil(math.log2(far + 2 * max(scene.window.size)))
     rows, columns = scene.grid.shape
     return Window((min(size, rows), min(size, columns))) if 4 * size <= max(rows, columns) else Whole()
-
-
-class OutcomeError(RuntimeError):
-    """The error that `check` raises; its message says what is wrong with a result and what to do.
-
-    Example:
-        >>> import jaxsand as js
-        >>> issubclass(js.OutcomeError, RuntimeError)
-        True
-    """
-
-
-_ADVICE = {
-    Outcome.WINDOW_EDGE: (
-        "sand moved at the window's edge, or the map was not still before the tool came down: enlarge Window(size) or use "
-        "Whole(), and settle to the window's tolerance first"
-    ),
-    Outcome.NOT_STILL: (
-        "the sand is not still ({residual:.2g} in slope above repose after {sweeps} sweeps): raise the stop rule's bound or "
-        "tolerance, or, where heights are large against the spacing, subtract their mean or use float64"
-    ),
-    Outcome.NOT_FINITE: (
-        "the map, the stroke or the scene holds a NaN or an infinity, or heights overflowed: look with numpy.isfinite"
-    ),
-}
-
-
-def check(result: Settled | Pushed) -> None:
-    """Raises an error with advice if a computation did not end well.
-
-    Call it on results outside `jit`, `vmap` and `grad`: inside, outcomes are not known yet.
-
-    Args:
-        result: what `settle`, `step`, `follow`, `rollout`, `act` or their batches returned.
-
-    Raises:
-        OutcomeError: the outcome of the result, or of any in a batch, is not 0; see `Outcome`.
-        ValueError: the result is being traced, or is none.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> import jaxsand as js
-        >>> heap = jnp.zeros((8, 8)).at[4, 4].set(0.03)
-        >>> js.check(js.settle(js.make_scene((8, 8), 0.01), heap, stop=js.Sweeps(8)))
-        Traceback (most recent call last):
-            ...
-        jaxsand.interaction.simulate.OutcomeError: the sand is not still (...
-    """
-    if not isinstance(result, Settled | Pushed):
-        raise ValueError(f"result: got {type(result).__name__}; give what settle, step or another push returned")
-    outcome = concrete(result.outcome)
-    if outcome is None:
-        raise ValueError("result: got a traced value; call check outside jit, vmap and grad")
-    bad = np.flatnonzero(outcome.ravel())
-    if not bad.size:
-        return
-    first = bad[0]
-    code = Outcome(int(outcome.ravel()[first]))
-    detail = {}
-    if isinstance(result, Settled):
-        detail["residual"] = float(np.ravel(result.residual)[first])
-        detail["sweeps"] = int(np.broadcast_to(result.sweeps, outcome.shape).ravel()[first])
-    where = f"{bad.size} of {outcome.size} maps, first {int(first)}: " if outcome.ndim else ""
-    raise OutcomeError(where + "; ".join(advice.format(**detail) for bit, advice in _ADVICE.items() if bit in code))
 
 
 def windows_for(scene: Scene, push: PushRule, times: float = 1) -> Iterator[Scene]:

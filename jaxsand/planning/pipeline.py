@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.goals import metrics
-from jaxsand.interaction.simulate import Shaped, check, follow_frames
+from jaxsand.interaction.outcome import check
+from jaxsand.interaction.simulate import Shaped, follow_frames
 from jaxsand.planning.binary import Cell, connected_pieces, plan
 from jaxsand.planning.gradient import Optimised
 from jaxsand.planning.learned.stages import Planned

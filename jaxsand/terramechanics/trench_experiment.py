@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.interaction.outcome import check
 from jaxsand.interaction.rule import PushRule
-from jaxsand.interaction.simulate import check, step
+from jaxsand.interaction.simulate import step
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.interaction.wheel_closed_form import SplitPush
 from jaxsand.relaxation.batching import cores

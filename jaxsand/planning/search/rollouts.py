@@ -6,7 +6,8 @@ import numpy as np
 
 from jaxsand.interaction.batched import act_batch, step_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
-from jaxsand.interaction.simulate import check, follow
+from jaxsand.interaction.outcome import check
+from jaxsand.interaction.simulate import follow
 from jaxsand.planning.search.actions import Path
 from jaxsand.relaxation.settling import Settled, settle_batch
 from jaxsand.relaxation.stopping import Sweeps

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsand.goals import metrics, surfaces
 from jaxsand.goals.surfaces import rough_surface
-from jaxsand.interaction.simulate import check
+from jaxsand.interaction.outcome import check
 from jaxsand.planning.search.actions import Actions, Lattice, Steps
 from jaxsand.planning.search.rollouts import replay
 from jaxsand.relaxation.settling import settle
