@@ -60,8 +60,10 @@ def lay(block: Block, frame: Frame, first: First, flux: Fluxes) -> Laid:
 
 def seen(block: Block, frame: Frame, first: First, laid: Laid) -> Fluxes:
     """The fluxes in the block of a frame that begins at `first`; 0 where nothing is known."""
-    column, row = _corner(block, frame, first)
-    moved = tuple(_moved(_moved(f, row - laid.row, 0), column - laid.column, 1) for f in laid.flux)
+    moved = laid.flux
+    if block.follows or block.shape[0] != block.shape[1]:  # else the block is the map, in every frame
+        column, row = _corner(block, frame, first)
+        moved = tuple(_moved(_moved(f, row - laid.row, 0), column - laid.column, 1) for f in moved)
     return _swapped(block.neighbours, _mirrored(block.neighbours, moved, frame.flip_x, frame.flip_y), frame.swap)
 
 

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
+from jaxsand.autodiff.while_loop import Step as LoopStep
 from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
 from jaxsand.interaction._advance import Step
 from jaxsand.interaction._block import Block, Moving
@@ -21,12 +22,10 @@ from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, reach
 
 
-class Loop(Protocol):
+class Repeated(LoopStep, Protocol):
     """A step that is repeated until it is done."""
 
-    def done(self, params: Any, k: jax.Array, state: Moving) -> jax.Array: ...
-
-    def __call__(self, params: Any, k: jax.Array, sand: Moving) -> Moving: ...
+    def done(self, params: Any, k: jax.Array, sand: Moving, /) -> jax.Array: ...
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,8 @@ class Steps:
 
     block: Block
     lower: Step
-    turn: Any
-    ahead: Any
+    turn: Repeated
+    ahead: Repeated
     substep: float
     bound: float
     keeps: bool
