@@ -121,12 +121,11 @@ def test_how_sand_flows_is_kept_from_one_frame_to_another(neighbours):
 @pytest.mark.compiled
 def test_isotropic_sand_moves_alike_in_float32():
     """A gradient that was just at repose once counted as far beyond it, where a compiler rounded its square differently in two
-    places: in float32 one stroke in twenty dug up to a tenth too much."""
+    places: in float32 these strokes were 17 and 16% off."""
     sand = js.make_scene((64, 64), 0.005, ANGLE, "isotropic", tool=js.Blade(0.06, 0.03, 0.02))
-    places = np.array([[0.25, 0.8125], [0.25, 0.75], [0.21, 0], [0.22, 0], [0.265, 0], [0.28, 0], [0, 0], [0.0625, 0.875]])
-    strokes = np.array([0.1, 0.16, 0.22, 0.16]) + 0.005 * np.tile(places[:, ::-1], 2)
+    strokes = np.array([0.1, 0.16, 0.14, 0.16]) + 0.005 * np.array([[0, 0.18, 0, 0.18], [0, 0.27, 0, 0.27]])
     push = js.SteppedPush(1 / 32, 32)
-    maps = [np.asarray(js.step_batch(sand, np.zeros((8, 64, 64), d), strokes, push=push).height) for d in ("f4", "f8")]
+    maps = [np.asarray(js.step_batch(sand, np.zeros((2, 64, 64), d), strokes, push=push).height) for d in ("f4", "f8")]
     apart = np.abs(maps[0] - maps[1]).sum((1, 2)) / np.abs(maps[1]).sum((1, 2))
     assert apart.max() < 1e-3
 
