@@ -130,6 +130,17 @@ def test_isotropic_sand_moves_alike_in_float32():
     assert apart.max() < 1e-3
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("tool", "most"), [(js.Blade(), 1e-3), (js.Wheel(), 0.02)])
+@pytest.mark.parametrize("neighbours", [4, 8, "isotropic"])
+@pytest.mark.parametrize("push", [js.SteppedPush(), js.SteppedPush(1 / 32, 32)])
+def test_random_pushes_move_alike_in_float32(tool, most, neighbours, push):
+    sand, strokes = square(32, neighbours, tool=tool), np.random.default_rng(1).uniform(0.04, 0.28, (64, 4))
+    maps = [np.asarray(js.step_batch(sand, np.zeros((64, 32, 32), d), strokes, push=push).height) for d in ("f4", "f8")]
+    apart = np.abs(maps[0] - maps[1]).sum((1, 2)) / np.abs(maps[1]).sum((1, 2))
+    assert apart.max() < most
+
+
 def test_nothing_drains_over_a_rim_above_the_sand():
     stroke, level = [0.16, 0.16, 0.16, 0.5], np.zeros((32, 32))
     drained = {}
