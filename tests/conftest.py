@@ -84,9 +84,3 @@ def turned(stroke: Sequence[float], side: float) -> list[tuple[Callable, tuple[f
 @pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def dtype(request: pytest.FixtureRequest) -> str:
     return request.param
-
-
-def half_turn(parts):
-    """A path that turns by half a turn in so many parts, all but in place, at (0.16, 0.16)."""
-    headings = math.pi * np.arange(parts + 1) / parts
-    return 0.16 + 1e-5 * np.concatenate([np.zeros((1, 2)), np.cumsum(np.c_[np.cos(headings), np.sin(headings)], 0)])

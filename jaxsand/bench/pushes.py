@@ -163,7 +163,7 @@ def push_against_spacing(tell: Tell = quiet, batch: int = 8) -> list[dict[str, A
         h = _batch(scene, level, np.asarray(random_strokes(batch)), push=SteppedPush())
         maps[n] = h.reshape(batch, 16, n // 16, 16, n // 16).mean((2, 4))
     sides = (16, 32, 64)
-    errors = [float(np.abs(maps[n] - maps[128]).sum() / np.abs(maps[128]).sum()) for n in sides]
+    errors = [_share(maps[n], maps[128]) for n in sides]
     order = -float(np.polyfit(np.log(sides), np.log(errors), 1)[0])
     return [{"cells": n, "error": e, "fitted_order": order} for n, e in zip(sides, errors, strict=True)]
 
@@ -234,11 +234,7 @@ def in_parts(tell: Tell = quiet) -> list[dict[str, Any]]:
     """How far a path in many legs is from the same path in one, over what that changes: a line of 16 cm askew to the cells
     by the default blade, and half a turn of a blade of 10 cells all but in place."""
     rows = []
-    headings = {legs: math.pi * np.arange(legs + 1) / legs for legs in (1, 4, 16)}
-    turns = {
-        legs: 0.16 + 1e-5 * np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([np.cos(a), np.sin(a)], 1), 0)])
-        for legs, a in headings.items()
-    }
+    turns = {legs: half_turn(legs) for legs in (1, 4, 16)}
     start, stop = np.array([0.086, 0.129]), np.array([0.234, 0.191])
     lines = {legs: np.linspace(start, stop, legs + 1) for legs in (1, 4, 16, 64)}
     kinds: list[tuple[str, Blade, dict[int, np.ndarray]]] = [
@@ -256,11 +252,17 @@ def in_parts(tell: Tell = quiet) -> list[dict[str, Any]]:
                     "path": name,
                     "neighbours": neighbours,
                     "legs": n,
-                    "apart": float(np.abs(h - one).sum() / np.abs(one).sum()),
+                    "apart": _share(h, one),
                 }
                 for n, h in zip(list(paths)[1:], others, strict=True)
             ]
     return rows
+
+
+def half_turn(parts: int) -> np.ndarray:
+    """A path [n, 2] (m) that turns by half a turn in so many parts, all but in place, at (0.16, 0.16)."""
+    headings = math.pi * np.arange(parts + 1) / parts
+    return 0.16 + 1e-5 * np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([np.cos(headings), np.sin(headings)], 1), 0)])
 
 
 def heaps(
@@ -319,18 +321,20 @@ def _batch(scene: Scene, starts: np.ndarray, strokes: np.ndarray, *, push: Stepp
     return np.asarray(step_batch(scene, starts, strokes, push=push).height, float)
 
 
-def _apart(h: np.ndarray, best: np.ndarray, start: np.ndarray) -> dict[str, float]:
-    def share(x: np.ndarray, y: np.ndarray) -> float:
-        return float(np.abs(x - y).sum() / np.abs(y).sum())
+def _share(x: np.ndarray, y: np.ndarray) -> float:
+    """How far x is from y, over the size of y."""
+    return float(np.abs(x - y).sum() / np.abs(y).sum())
 
+
+def _apart(h: np.ndarray, best: np.ndarray, start: np.ndarray) -> dict[str, float]:
     each = np.abs(h - best).sum((1, 2)) / np.abs(best - start).sum((1, 2))
     dug = [np.minimum(x - start, 0).sum((1, 2)) for x in (h, best)]
     berm = [(x - start).max((1, 2)) for x in (h, best)]
     return {
         "error": float(np.abs(h - best).sum() / np.abs(best - start).sum()),
         "worst": float(each.max()),
-        "dug_error": share(*dug),
-        "berm_error": share(*berm),
+        "dug_error": _share(*dug),
+        "berm_error": _share(*berm),
     }
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxsand.autodiff.while_loop import Step as LoopStep
 from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
 from jaxsand.interaction._advance import Step
-from jaxsand.interaction._block import Block, Moving
+from jaxsand.interaction._block import Block, Moving, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._frame import Frame, frame_of
 from jaxsand.interaction._kept import Kept, Laid, lay, seen
@@ -25,6 +25,15 @@ from jaxsand.scene.tools import Pose, reach
 class Repeated(LoopStep, Protocol):
     """A step that is repeated until it is done."""
 
+    @property
+    def block(self) -> Block: ...
+
+    @property
+    def substep(self) -> float: ...
+
+    @property
+    def keeps(self) -> bool: ...
+
     def done(self, params: Any, k: jax.Array, sand: Moving, /) -> jax.Array: ...
 
 
@@ -33,22 +42,16 @@ class Steps:
     """What a tool does on a leg.
 
     Attributes:
-        block: the part of the map that is computed.
         lower: the step in which the tool comes down.
         turn: a sub-step of a turn in place.
         ahead: the sub-steps ahead within a spacing.
-        substep: length of a sub-step (spacings).
         bound: largest length of a leg (spacings).
-        keeps: whether another leg follows.
     """
 
-    block: Block
     lower: Step
     turn: Repeated
     ahead: Repeated
-    substep: float
     bound: float
-    keeps: bool
 
 
 Params = Callable[[Pose, jax.Array, jax.Array], Tree]  # of a pose, the length of a leg (m) and the angle before it (rad)
@@ -63,7 +66,7 @@ def moved(
     scene: Scene, job: Job, steps: Steps, params: Params, pose: Pose, length: jax.Array, before: Pose | None, state: State
 ) -> State:
     """Lowers the tool, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
-    shape, dx, block = scene.grid.shape, job.bed.spacing, steps.block
+    shape, dx, block, substep = scene.grid.shape, job.bed.spacing, steps.ahead.block, steps.ahead.substep
     h, lost, edge, kept = state
     none = no_flux(block.neighbours, block.drains, jnp.zeros((block.size, block.size), h.dtype))
     flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
@@ -77,7 +80,7 @@ def moved(
         assert isinstance(kept, Kept)
         sand, kept = _turned(job, steps, params, shape, pose, before, kept, sand)
     start, onmap = over_the_map(scene, job, pose, length)
-    stride = chunk(steps.substep) * steps.substep
+    stride = chunk(substep) * substep
     bound = math.ceil(steps.bound / stride) + 1
     frame = frame_of(shape, _in_spacings(start, dx))
 
@@ -89,7 +92,7 @@ def moved(
         alike = jnp.clip(before.cos * pose.cos + before.sin * pose.sin, 0, 1)
         flux = _times(alike, seen(block, frame, first(jnp.int32(0)), kept.ahead))
     sand, count = repeat_until(steps.ahead.done, steps.ahead, bound, params(start, onmap, zero), replace(sand, flux=flux))
-    if steps.keeps:
+    if steps.ahead.keeps:
         last = count - 1 - int(before is None)
         kept = replace(kept, ahead=lay(block, frame, first(last), sand.flux), since=kept.since + length / dx)
     h, lost = jax.tree.map(lambda x: x.reshape(shape), (sand.height, sand.lost))
@@ -99,23 +102,41 @@ def moved(
 def _turned(
     job: Job, steps: Steps, params: Params, shape: tuple[int, int], pose: Pose, before: Pose, kept: Kept, sand: Moving
 ) -> tuple[Moving, Kept]:
-    """Turns the tool in place from the pose before."""
-    dx, no = job.bed.spacing, jnp.zeros((), bool)
+    """Turns the tool in place from the pose before, which is at the leg's start already (see `along_legs`)."""
+    dx, block, no = job.bed.spacing, steps.turn.block, jnp.zeros((), bool)
     angle = turn_between(before, pose)
-    frame = Frame(_in_spacings(replace(before, x=pose.x, y=pose.y), dx), no, no, no, shape)
-    first = steps.block.corner(frame.pose.x, frame.pose.y)
+    frame = Frame(_in_spacings(before, dx), no, no, no, shape)
+    first = block.corner(frame.pose.x, frame.pose.y)
     sense = jnp.sign(angle)
     alike = jnp.where(sense * kept.sense < 0, 0, jnp.clip(1 - kept.since * dx / reach(job.tool), 0, 1))
-    flux = _times(alike, seen(steps.block, frame, first, kept.turned))
-    turn = params(Pose(pose.x, pose.y, before.cos, before.sin), jnp.zeros_like(angle), angle)
-    bound = math.ceil(math.pi * math.hypot(*shape) / steps.substep) + 1
+    flux = _times(alike, seen(block, frame, first, kept.turned))
+    turn = params(before, jnp.zeros_like(angle), angle)
+    bound = math.ceil(math.pi * math.hypot(*shape) / steps.turn.substep) + 1
     sand, _ = repeat_until(steps.turn.done, steps.turn, bound, turn, replace(sand, flux=flux))
     turns = sense != 0
     return sand, replace(
         kept,
-        turned=lay(steps.block, frame, first, sand.flux),
+        turned=lay(block, frame, first, sand.flux),
         sense=jnp.where(turns, sense, kept.sense),
         since=jnp.where(turns, 0, kept.since),
+    )
+
+
+def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.Array, side: jax.Array) -> Way:
+    """A leg in spacings, of a tool that reaches by `half` ahead and by `side` aside (spacings); see `Way`."""
+    dx, drop, rim = job.bed.spacing, job.bed.drop, job.bed.rim
+    return Way(
+        _in_spacings(pose, dx),
+        length / dx,
+        half,
+        side,
+        job.bottom,
+        dx,
+        job.flow.quantum,
+        drop.reshape(-1) if drop.ndim else drop,
+        None if rim is None else rim.level,
+        job.flow.rate,
+        angle,
     )
 
 

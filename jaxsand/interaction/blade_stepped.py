@@ -14,6 +14,7 @@ stroke.
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import jax
@@ -27,7 +28,7 @@ from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._advance import Advance, Rest
 from jaxsand.interaction._block import SPARE, Block, Way
 from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._leg import Steps, chunk, moved
+from jaxsand.interaction._leg import Steps, chunk, moved, way_of
 from jaxsand.interaction._lowering import Lower
 from jaxsand.interaction._path import Pushed, Record, State, along_legs
 from jaxsand.interaction._turning import Turn
@@ -56,9 +57,7 @@ def push_along(
     `rest` is the function that brings the sand to rest after each sub-step.
     """
 
-    def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        return _leg(scene, push, rest, path.shape[0] > 2, job, pose, length, before, state)
-
+    leg = partial(_leg, scene, push, rest, path.shape[0] > 2)
     return along_legs(scene, height, path, push.rate, leg, record)
 
 
@@ -86,23 +85,10 @@ def _leg(
         state = h, lost, jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, edge), kept
 
     def way(pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
-        drop = job.bed.drop
-        return Way(
-            Pose(pose.x / dx, pose.y / dx, pose.cos, pose.sin),
-            length / dx,
-            jnp.asarray(job.tool.thickness) / dx / 2,
-            jnp.asarray(job.tool.width) / dx / 2,
-            job.bottom,
-            dx,
-            job.flow.quantum,
-            drop.reshape(-1) if drop.ndim else drop,
-            job.bed.rim.level if job.bed.rim is not None else None,
-            job.flow.rate,
-            angle,
-        )
+        half, side = (jnp.asarray(extent) / dx / 2 for extent in (job.tool.thickness, job.tool.width))
+        return way_of(job, pose, length, angle, half, side)
 
     steps = Steps(
-        block,
         Lower(block),
         Turn(block, substep=substep, sweeps=push.sweeps, rest=rest, keeps=keeps),
         Advance(
@@ -114,9 +100,7 @@ def _leg(
             rest=rest,
             keeps=keeps,
         ),
-        substep,
         2 * math.hypot(*shape) + 3,  # make_scene holds the thickness below the map's diagonal
-        keeps,
     )
     return moved(scene, job, steps, way, pose, length, before, state)
 

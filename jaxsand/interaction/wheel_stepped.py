@@ -23,9 +23,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.interaction._block import Block, Way
+from jaxsand.interaction._block import Block
 from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._leg import Steps, chunk, moved
+from jaxsand.interaction._leg import Steps, chunk, moved, way_of
 from jaxsand.interaction._path import Pushed, Record, State, along_legs
 from jaxsand.interaction._rolling import Roll, Touchdown, Turn
 from jaxsand.interaction._wheel import Track
@@ -42,9 +42,7 @@ def roll_along(
 ) -> tuple[Pushed, Tree]:
     """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
 
-    def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        return _leg(scene, push, path.shape[0] > 2, job, pose, length, before, state)
-
+    leg = partial(_leg, scene, push, path.shape[0] > 2)
     return along_legs(scene, height, path, push.rate, leg, record)
 
 
@@ -65,33 +63,17 @@ def _leg(
         size = min(size, max(scene.window.size))
     block = Block(shape, size, size, size < max(shape), scene.grid.neighbours, job.bed.rim is not None)
     steps = Steps(
-        block,
         Touchdown(block),
         Turn(block, substep=substep, sweeps=sweeps, keeps=keeps),
         Roll(block, substep=substep, sweeps=sweeps, chunk=chunk(substep), lowered=before is None, keeps=keeps),
-        substep,
         4 * math.hypot(*shape) + 3,  # make_scene holds radius and width below the map's diagonal
-        keeps,
     )
     return moved(scene, job, steps, partial(_track, job), pose, length, before, state)
 
 
 def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
     """A leg of the wheel in spacings; `angle` is the turn in place before it (rad)."""
-    dx, wheel, drop, rim = job.bed.spacing, job.tool, job.bed.drop, job.bed.rim
-    chord = half_chord(wheel)
-    way = Way(
-        Pose(pose.x / dx, pose.y / dx, pose.cos, pose.sin),
-        length / dx,
-        chord / dx,
-        jnp.asarray(wheel.width) / dx / 2,
-        job.bottom,
-        dx,
-        job.flow.quantum,
-        drop.reshape(-1) if drop.ndim else drop,
-        None if rim is None else rim.level,
-        job.flow.rate,
-        angle,
-    )
+    dx, wheel = job.bed.spacing, job.tool
+    way = way_of(job, pose, length, angle, half_chord(wheel) / dx, jnp.asarray(wheel.width) / dx / 2)
     carried = None if isinstance(wheel.grousers, Smooth) else carried_area(wheel, wheel.grousers) / dx
     return Track(way, jnp.asarray(wheel.radius) / dx, jnp.asarray(wheel.slip_angle), carried)

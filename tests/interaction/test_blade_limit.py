@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.bench.pushes import heap, push_speed
+from jaxsand.bench.pushes import half_turn, heap, push_speed
 from jaxsand.goals.metrics import volume_error
 
-from ..conftest import ANGLE, half_turn
+from ..conftest import ANGLE
 
 DX = 0.01
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.bench.pushes import half_turn
 from jaxsand.goals.metrics import volume_error
 
-from ..conftest import ANGLE, MU, half_turn
+from ..conftest import ANGLE, MU
 
 DX = 0.01
 

@@ -105,6 +105,7 @@ def heaps(many=24):
     return h
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("neighbours", [4, 8, "isotropic"])
 @pytest.mark.parametrize("scheme", [js.Relaxation(), js.SuperTimeStepping()])
 def test_settling_in_a_window_is_equal_or_flagged(scheme, neighbours):
@@ -116,11 +117,10 @@ def test_settling_in_a_window_is_equal_or_flagged(scheme, neighbours):
     for size in ((12, 12), (26, 26), (40, 40)):
         out = js.settle_batch(scene, h, scheme=scheme, window=js.Window(size, tolerance=0.0))
         change = np.abs(np.asarray(out.height) - whole.height).max((1, 2))
-        # Square roots round differently, which may make one map still a step sooner or later.
-        same = change <= (1e-3 * DX if neighbours == "isotropic" else 0)
+        same = change <= (1e-6 if neighbours == "isotropic" else 0)  # rounding of square roots, on heights of 0.1
         flagged = np.asarray(out.outcome) != 0
         assert np.all(same | flagged)
-        assert np.sum(out.sweeps[~flagged] != whole.sweeps[~flagged]) <= (neighbours == "isotropic")
+        assert np.array_equal(out.sweeps[~flagged], whole.sweeps[~flagged])
         assert max(volume_error(a, b) for a, b in zip(h, out.height, strict=True)) <= 1e-6
         clean.append(int(np.sum(~flagged)))
     assert clean[0] < 6

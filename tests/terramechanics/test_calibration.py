@@ -38,19 +38,18 @@ def off(found, degrees):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("count", [12, pytest.param(48, marks=pytest.mark.slow)])
-def test_one_noisy_collapse_tells_the_angle_and_how_well(count):
+def test_one_noisy_collapse_tells_the_angle_and_how_well():
     """Within 0.2 degrees for angles from 20 to 40, and from wrong guesses; errors over standard errors spread by 1."""
     pulls = []
-    for seed in range(count):
-        true, guess = 20 + seed * 20 / (count - 1), 15 + (seed * 7 % 31)
+    for seed in range(24):
+        true, guess = 20 + seed * 20 / 23, 15 + (seed * 7 % 31)
         found = js.calibrate(sand(guess), js.Trial(PILLAR, collapsed(true) + noise(seed)), free=ANGLE)
         assert not found.verdict
         assert abs(off(found, true)) < 0.2
         assert found.noise == pytest.approx(NOISE, rel=0.1)
         pulls.append(off(found, true) / math.degrees(found.noise_errors["repose_angle"]))
-    assert abs(np.std(pulls) - 1) < 2.2 / math.sqrt(2 * count) + 0.05  # three standard deviations, or nearly
-    assert abs(np.mean(pulls)) < 3 / math.sqrt(count)
+    assert 0.7 < np.std(pulls) < 1.35
+    assert abs(np.mean(pulls)) < 0.65  # three of its standard deviations
 
 
 @pytest.mark.slow
@@ -76,7 +75,7 @@ def check_cones(rows):
 
 @pytest.mark.long
 def test_the_exact_cones_angle_lies_within_two_stated_errors():
-    check_cones(bench_cone(seeds=1))
+    check_cones(bench_cone(seeds=4))
 
 
 @pytest.mark.slow
