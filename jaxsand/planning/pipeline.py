@@ -15,6 +15,7 @@ import numpy as np
 from jaxsand.goals import metrics
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import Shaped, follow_frames
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.binary import Cell, connected_pieces, plan
 from jaxsand.planning.gradient import Optimised
 from jaxsand.planning.learned.stages import Planned
@@ -203,7 +204,7 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
     paths = tuple(stroke.reshape(2, 2) for stroke in placed)
     goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, _rounded(2))
     for path in paths:
-        shaped, _ = program(jnp.asarray(goal), _padded(path, _rounded(2)))
+        shaped, _ = program(jnp.asarray(goal), _padded(_divided(path, spacing), _rounded(2)))
         check(shaped)
         goal = np.asarray(shaped.height)
     return Target(name, "glyph", "strokes", scene, goal, paths, False, float(blade.depth))
@@ -236,18 +237,16 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) 
     prepared = time.perf_counter()
     height, compile_seconds, run_seconds = start, 0.0, 0.0
     frames, tools = [start], [_nowhere()]
-    ways = [_divided(path) for path in target.paths]
+    ways = [_divided(path, float(scene.grid.spacing)) for path in target.paths]
     longest = _rounded(max(map(len, ways), default=2))
     every = math.ceil(sum(map(len, ways)) * start.nbytes / _KEPT) or 1
-    for number, (path, way) in enumerate(zip(target.paths, ways, strict=True), 1):
-        tell(f"pushing path {number} of {len(target.paths)}" if number > 1 else "compiling")
+    for number, way in enumerate(ways, 1):
+        tell(f"pushing path {number} of {len(ways)}" if number > 1 else "compiling")
         program, compile_seconds = _program(scene, longest)
         began_to_run = time.perf_counter()
-        shaped, on_the_way = program(jnp.asarray(height), _padded(path, longest))
+        shaped, on_the_way = program(jnp.asarray(height), _padded(way, longest))
         check(shaped)
         run_seconds += time.perf_counter() - began_to_run
-        if way is not path:
-            on_the_way = program(jnp.asarray(height), _padded(way, longest))[1]
         maps, poses = _moments(way, np.asarray(on_the_way), every)
         height = np.array(shaped.height)
         frames += [*maps, height]
@@ -289,11 +288,19 @@ def _rounded(points: int) -> int:
     return _PARTS + 1 if points <= _PARTS + 1 else -(-points // 32) * 32
 
 
-def _divided(path: np.ndarray) -> np.ndarray:
-    """A single stroke as a path of short legs, for its recording; it leaves all but the same. Other paths as they are."""
-    if len(path) > 2 or not np.any(path[1] - path[0]):
+def _divided(path: np.ndarray, spacing: float) -> np.ndarray:
+    """A single stroke as a path of short legs, for its recording; other paths as they are.
+
+    All legs but the last are of whole sub-steps of the push, so that the path leaves what the stroke leaves, up to rounding.
+    """
+    run = path[-1] - path[0]
+    length = float(np.hypot(*run))
+    if len(path) > 2 or not length:
         return path
-    return path[0] + np.linspace(0, 1, _PARTS + 1)[:, None] * (path[1] - path[0])
+    substep = SteppedPush().substep * spacing / length
+    inner = np.unique(np.round(np.arange(1, _PARTS) / _PARTS / substep)) * substep
+    parts = np.array([0.0, *inner[(inner > 0) & (inner < 1)], 1.0])
+    return path[0] + parts[:, None] * run
 
 
 @cache

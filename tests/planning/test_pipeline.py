@@ -153,16 +153,39 @@ def test_a_recording_takes_no_more_memory_than_its_frames(monkeypatch):
         assert np.array_equal(result.tools[-2], [*to_and_fro[2], -1, 0])
 
 
-def test_a_strokes_recording_is_its_way():
-    stroke = [0.08, 0.1, 0.2, 0.16]
-    target = pipeline.Target(
-        "one", "glyph", "strokes", GLYPHS, np.zeros((32, 32)), (np.reshape(stroke, (2, 2)),), False, 0.0075
-    )
+def test_one_push_gives_a_strokes_result_and_its_recording(monkeypatch):
+    stroke, level = [0.08, 0.1, 0.2, 0.16], np.zeros((32, 32), np.float32)
+    target = pipeline.Target("one", "glyph", "strokes", GLYPHS, level, (np.reshape(stroke, (2, 2)),), False, 0.0075)
+    usual, pushes = pipeline._program, []
+
+    def program(scene, points):
+        run, seconds = usual(scene, points)
+        return lambda height, path: pushes.append(path) or run(height, path), seconds
+
+    monkeypatch.setattr(pipeline, "_program", program)
     result = shape(target)
+    assert len(pushes) == 1
     assert len(result.frames) == len(result.tools) == 8
-    assert result.tools[3] == pytest.approx([0.14, 0.13, 2 / 5**0.5, 1 / 5**0.5])
-    half = js.act(GLYPHS, np.zeros((32, 32), np.float32), [*stroke[:2], 0.14, 0.13]).height
-    assert np.abs(result.frames[3] - half).max() < 0.02 * 0.0075
-    whole = js.step(GLYPHS, np.zeros((32, 32), np.float32), stroke).height
-    assert np.abs(result.after - whole).max() < 1e-6
+    middle = result.tools[3, :2]
+    assert np.hypot(*(middle - [0.14, 0.13])) <= js.SteppedPush().substep * 0.01 / 2 + 1e-9
+    assert result.tools[3, 2:] == pytest.approx([2 / 5**0.5, 1 / 5**0.5])
+    half = js.act(GLYPHS, level, [*stroke[:2], *middle]).height
+    assert np.abs(result.frames[3] - half).max() < 1e-6
+    assert np.abs(result.after - js.step(GLYPHS, level, stroke).height).max() < 1e-6
     assert np.array_equal(result.frames[-1], result.after)
+
+
+def test_a_stroke_is_divided_at_whole_substeps():
+    substep = js.SteppedPush().substep * 0.01
+    for length in (0.3, 0.0707, 0.013, 0.003, 0.0005):
+        stroke = np.array([[0.1, 0.1], [0.1 + 0.6 * length, 0.1 - 0.8 * length]])
+        way = pipeline._divided(stroke, 0.01)
+        assert np.array_equal(way[[0, -1]], stroke)
+        assert 2 <= len(way) <= 7
+        legs = np.hypot(*np.diff(way, axis=0).T)
+        assert legs.min() > 0
+        assert legs.sum() == pytest.approx(length)
+        np.testing.assert_allclose(legs[:-1] / substep, np.round(legs[:-1] / substep), atol=1e-9)
+        assert len(way) < 7 or legs.max() - legs.min() <= 2 * substep
+    for path in (stroke[[0, 0]], np.array([[0.1, 0.1], [0.2, 0.1], [0.2, 0.2]])):
+        assert pipeline._divided(path, 0.01) is path
