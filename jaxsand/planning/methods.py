@@ -15,19 +15,19 @@ from jaxsand.scene.progress import Tell
 
 
 def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: int, seed: int, tell: Tell) -> Target:
-    """The target with at most `strokes` strokes from a search on real sand, which costs about `pushes` pushes (see
+    """The target with at most `strokes` strokes from a search on real sand, which costs at most `pushes` pushes (see
     `plan_sand`).
 
     The distance counts all sand, berms too, even where the goal is nowhere above height 0.
     """
     start = at_rest(target.scene, before, tell)
-    tell(f"searching {strokes} strokes in about {pushes} pushes")
+    tell(f"searching {strokes} strokes in {pushes} pushes")
     found = plan_sand(target.scene, start, target.goal, strokes=strokes, budget=pushes, seed=seed)
     return _by("search", target, found, found.paths)
 
 
 def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:
-    """The target with `strokes` strokes (None: as many as pay) from gradients, which cost about `pushes` pushes."""
+    """The target with `strokes` strokes (None: as many as pay) from gradients, which cost at most `pushes` pushes."""
     start = at_rest(target.scene, before, tell)
     tell("sketching")
     found = optimise_strokes(target.scene, target.goal, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)

@@ -1,5 +1,7 @@
 """The search over paths with the tool down, in layers of maps; each node also has the place where the tool stands."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 
@@ -16,20 +18,25 @@ Places = np.ndarray  # [n, 2]: row and column of corners
 
 
 def search_steps(job: Job, hint: Places, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
-    """The best path found for a job, at a cost of about `budget` full pushes of one leg each.
+    """The best path found for a job, at a cost of at most `budget` full pushes of one leg each.
 
     The path `hint` (rows and columns of corners [n, 2]) is kept in every layer as far as it goes, and judged with the
-    others.
+    others. Each leg takes four children, and a leg of the path that is judged at last: where the budget is too little for
+    that, paths are shorter, and where it is too little for one leg, the hint alone is judged.
 
     Returns:
       One path [n, 2] (m), or none if no path brings the sand closer; and what the search cost.
     """
     del rng  # nothing is drawn
-    width = max(1, int((budget - _JUDGED * job.strokes) / (4 * job.strokes)))
     at = corners(job.scene, job.actions)
-    found, effort = in_layers(job, _starts(job, at, width), hint, width)
-    paths = [hint[: job.strokes + 1]] if len(hint) > 1 else []
-    paths += [path for _, path in sorted(found, key=lambda pair: pair[0])[: _JUDGED - len(paths)]]
+    legs, judged = min(job.strokes, int(budget / 5)), 1
+    found, effort = list[tuple[float, Places]](), Effort()
+    if legs:
+        judged = min(_JUDGED, int(budget / legs) - 4)
+        width = int((budget - judged * legs) / (4 * legs))
+        found, effort = in_layers(replace(job, strokes=legs), _starts(job, at, width), hint, width)
+    paths = [hint[: (legs or min(job.strokes, int(budget))) + 1]] if len(hint) > 1 else []
+    paths += [path for _, path in sorted(found, key=lambda pair: pair[0])[: judged - len(paths)]]
     followed = [follow_padded(job.scene, job.height, at[tuple(path.T)], job.strokes) for path in paths]
     best = int(np.argmin(distance(np.stack([job.height, *followed]), job.goal)))
     legs = sum(len(path) - 1 for path in paths)

@@ -16,6 +16,7 @@ _TRIED = 8  # variants of a plan, the best by rough pushes, are pushed in full
 _WIDTH = 8  # nodes that a layer keeps
 _CHILDREN = 2  # of one node among them
 _PLANS = 12  # strokes in all plans that are improved at first; one plan at last
+_FULL = 0.75  # of what is left of the budget goes to full pushes at most, where it is too little for a whole turn
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,17 @@ class Nodes:
 
 
 def search_strokes(job: Job, hints: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
-    """The best strokes found for a job, at a cost of about `budget` full pushes; the strokes `hints` [m, 4] are tried
-    everywhere.
+    """The best strokes found for a job, at a cost of at most `budget` full pushes; the strokes `hints` [m, 4] are tried
+    everywhere, the first of them where the budget does not allow all.
     """
-    nodes, effort = in_layers(job, hints, _LAYERS * budget, _WIDTH, rng)
-    plan, more = improved(job, nodes.plans[: max(1, _PLANS // job.strokes)], budget - effort.cost, rng)
+    least = min(budget, 1.5 * job.strokes)  # a full push and six rough ones a layer
+    nodes, effort = in_layers(job, hints, max(_LAYERS * budget, least), _WIDTH, rng)
+    count = nodes.plans.shape[1]
+    affordable = int((budget - effort.cost) / count) if count else 0
+    if not affordable:
+        return [stroke.reshape(2, 2) for stroke in nodes.plans[0]], effort
+    plans = nodes.plans[: min(max(1, _PLANS // job.strokes), affordable)]
+    plan, more = improved(job, plans, budget - effort.cost, rng)
     return [stroke.reshape(2, 2) for stroke in plan], effort + more
 
 
@@ -46,18 +53,27 @@ def in_layers(job: Job, hints: np.ndarray, budget: float, width: int, rng: np.ra
     """Searches best-first in layers: the nodes of layer k have taken k strokes.
 
     All children of a layer are pushed roughly, the best of them in full, and of these the `width` best that differ are kept.
+    All layers cost at most `budget` full pushes. Where that is too little for every node to try all of `hints`, the closest
+    nodes try the first of them, and where it is too little for a push in every layer, plans have fewer strokes.
 
     They are ordered by distance from the goal, which is A*'s order: in f = g + h, with h the distance over the most that one
     stroke can change, g is the same for a whole layer and the divisor for all nodes.
     """
     grain = _GRAIN * np.abs(job.height - job.goal).max()
     nodes = Nodes(job.height[None], np.zeros((1, 0, 4)), distance(job.height[None], job.goal))
-    exact = max(2, int(budget / job.strokes / 2))
+    exact = max(1, int(budget / job.strokes / 2))
     effort = Effort()
     for _ in range(job.strokes):
-        share = max(2, int(exact / CHEAP / len(nodes.plans)) - len(hints))
-        ways = np.concatenate([[*propose(job.scene, job.actions, m, job.goal, share, rng), *hints] for m in nodes.maps])
-        parent = np.repeat(np.arange(len(nodes.plans)), share + len(hints))
+        ranked = _rough(min(exact, budget - effort.cost - exact))
+        if ranked < 2:
+            break
+        trying = min(len(nodes.plans), max(1, ranked // (2 + len(hints))))
+        some = hints[: ranked // trying - 2]
+        share = ranked // trying - len(some)
+        ways = np.concatenate(
+            [[*propose(job.scene, job.actions, m, job.goal, share, rng), *some] for m in nodes.maps[:trying]]
+        )
+        parent = np.repeat(np.arange(trying), share + len(some))
         rough = distance(roughly_pushed(job.scene, nodes.maps[parent], ways), job.goal)
         best = np.argsort(rough, kind="stable")[:exact]
         parent, ways = parent[best], ways[best]
@@ -75,7 +91,8 @@ def improved(job: Job, plans: np.ndarray, budget: float, rng: np.random.Generato
 
     Variants of a stroke are ranked roughly: the map expected of a variant is the map that the plan leaves, plus the
     difference that rough pushes make between the two. The best variants are pushed in full. Plans that lag behind are given
-    up on the way. Strokes at the end that do not help are left out at last.
+    up on the way. Strokes at the end that do not help are left out at last. All that is pushed, the plans themselves once,
+    costs at most `budget` full pushes; it must allow the plans.
 
     Returns:
       The plan [k, 4] (m), and what the search cost.
@@ -91,9 +108,14 @@ def improved(job: Job, plans: np.ndarray, budget: float, rng: np.random.Generato
         turn += 1
         anew = turn % (2 * count) == 0  # three times as dear as another turn
         tried = _far(job, plans[a], k, ways[a], rng) if anew else _near(job, plans[a], k, rng)
+        room = (budget - effort.cost) / (count - k)  # how often all strokes from k on can be pushed in full
+        full = min(_TRIED, int(_FULL * room))
+        tried = tried[: max(0, _rough(room - full) - 1)]
+        if not full or not len(tried):
+            break
         rough = finish(job.scene, np.concatenate([plans[a][None], tried]), k, ways[a][k][None], roughly_pushed)[-1]
         hoped = distance(ways[a][-1] + (rough[1:] - rough[0]), job.goal)
-        tried = tried[np.argsort(hoped, kind="stable")[:_TRIED]]
+        tried = tried[np.argsort(hoped, kind="stable")[:full]]
         after = finish(job.scene, tried, k, ways[a][k][None])
         ends = distance(after[-1], job.goal)
         steps = distance(after, job.goal)
@@ -116,6 +138,11 @@ def finish(scene: Scene, plans: np.ndarray, first: int, start: np.ndarray, push:
     for k in range(first, plans.shape[1]):
         maps.append(push(scene, maps[-1], plans[:, k]))
     return np.stack(maps)
+
+
+def _rough(cost: float) -> int:
+    """The number of rough pushes that cost no more than `cost` full ones."""
+    return int(cost / CHEAP + 1e-6)
 
 
 def _near(job: Job, plan: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
