@@ -82,7 +82,7 @@ def _polygon(rng: np.random.Generator) -> np.ndarray:
 
 
 def methods(most: int, pushes: int, key: int) -> dict[str, Callable[[SandLoss], np.ndarray]]:
-    """Methods that find strokes [N, 4] (m), at most `most`; gradients and the search cost about `pushes` pushes."""
+    """Methods that find strokes [N, 4] (m), at most `most`; gradients and the search cost at most `pushes` pushes."""
     policy = load_policy()
     return {
         "policy, looking ahead": lambda s: plan_by_policy(policy, s, most, Stages(width=6)).strokes,

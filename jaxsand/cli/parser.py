@@ -60,7 +60,7 @@ def _shape(commands: Any) -> None:
         "--pushes",
         type=count,
         metavar="N",
-        help="pushes that may be tried (optimise, policy --refine: 4000; search: 1000 a stroke)",
+        help="most pushes that are tried (optimise: 4000; search: 1000 a stroke; policy: its own, and 4000 by --refine)",
     )
     p.add_argument(
         "--lookahead",

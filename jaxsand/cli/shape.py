@@ -30,8 +30,9 @@ def run_shape(options: argparse.Namespace) -> None:
     began = time.perf_counter()
     target = _target(options)
     surface = _surface(options, target)
-    out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
     strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
+    polish = _polish(options, strokes)
+    out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
     if options.method == "search":
         target = searched(target, surface, strokes, options.pushes or 1000 * strokes, options.seed or 0, tell)
     if options.method == "optimise":
@@ -39,7 +40,6 @@ def run_shape(options: argparse.Namespace) -> None:
     if options.method == "policy":
         from jaxsand.planning.learned.stages import Stages
 
-        polish = (options.pushes or 4000) if options.refine else 0
         target = by_policy(target, surface, strokes, Stages(options.lookahead or 0, polish), tell)
     planned = time.perf_counter() - began
     result = shape(target, surface, tell)
@@ -84,6 +84,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
 
 _ROWS = "heights in metres, first row at y = 0; with --first-row top, on top as in pictures and maps"
 _OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".json", ".npz", ".svg", ".tif", ".tiff")
+_REFINED = 4000  # pushes by --refine, unless told otherwise
 _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
 
 _BY = {
@@ -108,6 +109,21 @@ def _check_options(options: argparse.Namespace) -> None:
             raise ValueError(f"{option.replace('_', '-')}: has an effect on .npy files only; leave it out")
     if options.method == "policy" and options.pushes and not options.refine:
         raise ValueError("pushes: has an effect on the policy with --refine only; add that, or leave it out")
+
+
+def _polish(options: argparse.Namespace, strokes: int) -> int:
+    """The pushes that are left to --refine of those allowed; those that the policy may take before come first."""
+    if not options.refine or options.pushes is None:
+        return _REFINED if options.refine else 0
+    from jaxsand.planning.learned.beam_search import most_calls
+
+    before, allowed = most_calls(strokes, options.lookahead or 0), int(options.pushes)
+    if allowed <= before:
+        raise ValueError(
+            f"pushes: got {allowed}, and the policy may take {before} for {strokes} strokes before --refine; give more, "
+            "or leave --refine out"
+        )
+    return allowed - before
 
 
 def _found(found: "SandPlan | Optimised | Planned") -> dict[str, Any]:

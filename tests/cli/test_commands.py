@@ -137,6 +137,10 @@ BAD = {
         ["shape", "L", "--method", "policy", "--pushes", "9"],
         "pushes: .*add that, or leave it out",
     ),
+    "fewer pushes than the policy takes": (
+        ["shape", "L", "--method", "policy", "--refine", "--strokes", "3", "--pushes", "3"],
+        "pushes: got 3, and the policy may take 3 for 3 strokes before --refine; give more",
+    ),
     "policy for a drawn goal": (["shape", "l.txt", "--method", "policy"], "method: 'policy' compares berms too"),
     "plan to nowhere": (["plan", "l.txt", "--end", "0,2"], r"end: got \(0, 2\)"),
     "plan to no cell": (["plan", "l.txt", "--end", "here"], "end: got 'here'"),
@@ -326,6 +330,21 @@ def test_the_policy_trenches_a_letter(here, capsys):
     assert (alone["method"], alone["goal_kind"], alone["steps"]) == ("policy", "glyph", 3)
     assert alone["search"]["rollouts"] == 3
     assert alone["iou"] > 0.8
+
+
+def test_the_pushes_of_a_policy_count_those_before_the_gradients():
+    from jaxsand.cli.parser import _parser
+    from jaxsand.cli.shape import _polish
+
+    def left(*arguments):
+        return _polish(_parser().parse_args(["shape", "L", "--method", "policy", *arguments]), 3)
+
+    assert left() == left("--lookahead", "2") == 0
+    assert left("--refine") == 4000
+    assert left("--refine", "--pushes", "100") == 97
+    assert left("--refine", "--pushes", "1000", "--lookahead", "2") == 1000 - (3 * 4 + 2 * 3 * 26 + 3)
+    with pytest.raises(ValueError, match="pushes: got 100, and the policy may take 171"):
+        left("--refine", "--pushes", "100", "--lookahead", "2")
 
 
 @pytest.mark.slow

@@ -62,8 +62,7 @@ def look_ahead(policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, t
 
     For each plan of the beam the policy proposes `width` strokes, which are pushed; the `width` closest plans whose maps
     differ form the next beam. The closest of all plans, of any length up to `strokes`, is refined by `put_right`; the plan
-    is empty if no stroke brings the sand closer. Takes at most N width^2 + 2 N (8 N + 2) + N calls of the simulator for N
-    strokes.
+    is empty if no stroke brings the sand closer. Takes at most `most_calls` calls of the simulator.
     """
     start = sand.start.astype(np.float32)
     maps, plans, losses = start[None], np.zeros((1, 0, 4)), np.array([sand.loss_of(start)])
@@ -85,6 +84,15 @@ def look_ahead(policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, t
     tell(f"putting {len(plan)} strokes right, {calls} pushes tried")
     plan, tried = put_right(sand, plan, least)
     return Ahead(plan, _losses(sand, plan), calls + tried + len(plan))
+
+
+def most_calls(strokes: int, width: int) -> int:
+    """How often a plan of up to `strokes` strokes calls the simulator at most, by `look_ahead` or, of width 0, by the policy
+    alone.
+
+    N strokes take N calls; to look ahead takes N width^2 for the beam and 2 N (8 N + 2) for `put_right` besides.
+    """
+    return strokes + (strokes * width**2 + 2 * strokes * (8 * strokes + 2) if width else 0)
 
 
 def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray, int]:
