@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +57,8 @@ def run_shape(options: argparse.Namespace) -> None:
     report = _report(result, ended - started, planned, ended - began, files)
     write_json(files["result.json"], report)
     tell("")
+    if target.found and target.found.reason:
+        print(f"warning: strokes: {target.found.reason}{_dug_alone(target)}", file=sys.stderr)
     show(options, report, _summary)
 
 
@@ -69,7 +72,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
         "lifted": result.lifted,
         "steps": result.steps,
         **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
-        **({"search": _found(target.found)} if target.found else {}),
+        **({"search": _found(target.found) | {"reason": target.found.reason}} if target.found else {}),
         **result.figures,
         "seconds": total,
         "seconds_plan": planned + seconds["prepare"],
@@ -242,6 +245,12 @@ def _heights(path: Path, field: str, options: argparse.Namespace) -> "np.ndarray
 
 def _drawn(options: argparse.Namespace) -> ValueError:
     return ValueError(f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method plan")
+
+
+def _dug_alone(target: "Target") -> str:
+    """What else to do about a goal that only digs."""
+    digs = target.goal.min() < 0 >= target.goal.max()
+    return ", or use --method plan, which compares only what is dug" if digs else ""
 
 
 def _deep_enough(heights: "np.ndarray", method: str) -> float:

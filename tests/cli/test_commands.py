@@ -272,11 +272,11 @@ def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypa
 
     def plan_sand(scene, start, goal, **options):
         asked.append((scene, start, goal))
-        return methods.SandPlan((), start, 1.0, 1.0, 0.0, 0.0, Effort())
+        return methods.SandPlan((), start, 1.0, 1.0, 0.0, 0.0, Effort(), "too little; give more")
 
     def optimise_strokes(scene, goal, start, **options):
         asked.append((scene, start, goal))
-        return methods.Optimised(np.zeros((0, 4)), np.ones(1), np.zeros(1), 0, start)
+        return methods.Optimised(np.zeros((0, 4)), np.ones(1), np.zeros(1), 0, start, "too little; give more")
 
     def plan(*_, **__):
         raise AssertionError("a binary plan that nobody uses")
@@ -285,7 +285,11 @@ def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypa
     monkeypatch.setattr(methods, "optimise_strokes", optimise_strokes)
     monkeypatch.setattr(pipeline, "plan", plan)
     assert main(["shape", "goal.npy", "--surface", "rough.npy", "--method", method, "--out", "out", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    digs = ", or use --method plan, which compares only what is dug" if name == "shallow trench" else ""
+    assert err == f"warning: strokes: too little; give more{digs}\n"
+    assert report["search"]["reason"] == "too little; give more"
     ((scene, start, given),) = asked
     assert np.array_equal(given, goal)
     assert np.ptp(start) == pytest.approx(0.01, rel=0.1)

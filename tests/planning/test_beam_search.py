@@ -113,6 +113,7 @@ def test_nothing_is_done_where_nothing_helps():
     planned = plan_by_policy(Always(F.strokes), done, 3, Stages(width=2, polish=100))
     assert len(planned.strokes) == 0
     assert planned.after == planned.before == 0
+    assert planned.reason.startswith("the sand lies as the goal has it already")
 
 
 @pytest.mark.slow

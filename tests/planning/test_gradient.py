@@ -120,6 +120,7 @@ def test_strokes_that_would_make_it_worse_are_not_given(bar):
         assert found.strokes.shape == (0, 4)
         assert found.losses.tolist() == [pytest.approx(16 * 5e-4**2)]
         assert not found.height.any()
+        assert "the goal has 8e-07 m^3 more sand than the map" in found.reason
         assert 0 < found.spent <= 40
 
 

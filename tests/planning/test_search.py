@@ -1,6 +1,7 @@
 """Planning on real sand: what a plan says of itself holds, and its bound does."""
 
 import math
+import re
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 import jaxsand as js
 from jaxsand.bench.rivals.search import binary, greedy, shooting
 from jaxsand.bench.sand import bench_sand
+from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search import rollouts
 from jaxsand.planning.search import steps as of_steps
 from jaxsand.planning.search import strokes as of_strokes
@@ -40,6 +42,7 @@ def test_a_plan_replayed_leaves_what_it_says(found):
     assert float(distance(np.asarray(rolled.height[-1]), GOAL)) == pytest.approx(found.after, rel=1e-3)
     assert found.before == float(distance(LEVEL, GOAL))
     assert 0 < len(found.paths) <= 2
+    assert found.reason is None
 
 
 def test_a_plan_gains_and_its_bounds_hold(found):
@@ -100,6 +103,22 @@ def test_at_the_goal_there_is_nothing_to_do():
     done = js.plan_sand(SCENE, GOAL, GOAL, strokes=2, budget=BUDGET)
     assert (done.paths, done.before, done.after, done.reduction, done.effort) == ((), 0.0, 0.0, 0.0, Effort())
     assert done.strokes.shape == (0, 4)
+    assert done.reason.startswith("the sand lies as the goal has it already")
+
+
+def test_where_no_stroke_is_found_the_plan_says_why():
+    trench = LEVEL.copy()
+    trench[7, 3:11] = -0.0005  # far shallower than the blade digs
+    done = js.plan_sand(SCENE, LEVEL, trench, strokes=1, budget=30)
+    assert done.paths == ()
+    assert re.match("no stroke .* berms count: the goal has 4e-07 m.3 less sand .*; give .* berms of what", done.reason)
+    assert "4e-07 m^3 more sand" in why_no_strokes(SCENE, LEVEL, -trench)
+    for scene in (
+        js.make_scene(SHAPE, 0.01, tool=js.Blade(), edge=js.Draining(-0.1)),  # sand may go, or has been walled in
+        js.make_scene(SHAPE, 0.01, tool=js.Blade(), walls=js.Walls(np.indices(SHAPE)[0] == 7)),
+    ):
+        assert "less sand" not in why_no_strokes(scene, LEVEL, trench)
+    assert re.match("no stroke .* berms count; allow more", why_no_strokes(SCENE, trench, np.roll(trench, 1, 0)))
 
 
 def test_steps_find_a_path_again():

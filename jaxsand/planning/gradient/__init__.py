@@ -15,6 +15,7 @@ import numpy as np
 from jaxsand.planning.gradient import moves
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses
+from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.stroke_loss import Best, SandLoss, pushed
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.masked import gaps
@@ -38,6 +39,7 @@ class Optimised:
       calls: after how many calls of the simulator each of `losses` was found [K].
       spent: calls in all: pushes simulated, a gradient counted as what it costs.
       height: the map [H, W] (m) that `strokes` leave.
+      reason: why there are no strokes, and what to do; None where there are some.
 
     Example:
       >>> import jax.numpy as jnp
@@ -53,6 +55,7 @@ class Optimised:
     calls: np.ndarray
     spent: int
     height: np.ndarray
+    reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -112,8 +115,8 @@ def optimise_strokes(
       tell: is called with a line of progress.
 
     Returns:
-      An `Optimised`, with no strokes where nothing is to change or no plan brings the sand closer to the goal. Not
-      differentiable itself.
+      An `Optimised`; where nothing is to change or no plan brings the sand closer to the goal it has no strokes, and
+      `reason` says why. Not differentiable itself.
 
     Raises:
       ValueError: for a scene without a blade, a start or goal of another shape, or a key or count out of range.
@@ -154,7 +157,9 @@ def optimise_strokes(
     steps = [Best(0, account.before, np.zeros((0, 4))), *(best for best in account.history if best.loss < account.before)]
     found = steps[-1].strokes
     height = sand.maps(found[None])[0]
-    return Optimised(found, np.array([s.loss for s in steps]), np.array([s.calls for s in steps]), account.calls, height)
+    losses, calls = np.array([s.loss for s in steps]), np.array([s.calls for s in steps])
+    reason = None if len(found) else why_no_strokes(scene, sand.start, sand.goal)
+    return Optimised(found, losses, calls, account.calls, height, reason)
 
 
 def search(

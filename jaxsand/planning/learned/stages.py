@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.learned.beam_search import Proposes, look_ahead, one_after_the_other
+from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.stroke_loss import SandLoss
 from jaxsand.scene.progress import Tell, quiet
 
@@ -32,12 +33,14 @@ class Planned:
       before: squared distance (m^2) of the start from the goal.
       after: squared distance (m^2) after the strokes.
       calls: how often the simulator was called.
+      reason: why there are no strokes, and what to do; None where there are some.
     """
 
     strokes: np.ndarray
     before: float
     after: float
     calls: int
+    reason: str | None = None
 
 
 def plan_by_policy(
@@ -67,4 +70,5 @@ def plan_by_policy(
         calls += polished.spent
         if polished.losses[-1] < after:
             plan, after = polished.strokes, float(polished.losses[-1])
-    return Planned(plan, before, after, calls)
+    reason = None if len(plan) else why_no_strokes(sand.scene, sand.start, sand.goal)
+    return Planned(plan, before, after, calls, reason)

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from jaxsand.goals import metrics
+from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search.actions import Actions, Job, Lattice, Path, Steps, longest_stroke
 from jaxsand.planning.search.binary import binary_hints, binary_paths
 from jaxsand.planning.search.reach import blade_size, least_distance
@@ -31,6 +32,7 @@ class SandPlan:
       estimate: a guess (m) of what could be reached: what is left if every stroke gains as much as the best of all that were
         tried.
       effort: how many pushes were simulated, in full and roughly.
+      reason: why there are no paths, and what to do; None where there are some.
 
     Example:
       >>> import numpy as np
@@ -48,6 +50,7 @@ class SandPlan:
     lower_bound: float
     estimate: float
     effort: Effort
+    reason: str | None = None
 
     @property
     def gap(self) -> float:
@@ -94,7 +97,7 @@ def plan_sand(
       seed: equal seeds give equal plans.
 
     Returns:
-      A `SandPlan`; it has no paths where nothing brings the sand closer to the goal.
+      A `SandPlan`; where nothing brings the sand closer to the goal it has no paths, and `reason` says why.
 
     Raises:
       ValueError: for a scene without a blade, maps that do not fit it or are not at rest, or options out of range.
@@ -126,7 +129,8 @@ def plan_sand(
         paths, after, left = [], height, before
     bound = least_distance(scene, height, goal, strokes, longest_stroke(scene, actions))
     estimate = max(0.0, before - strokes * effort.gain)
-    return SandPlan(tuple(paths), after, before, left, bound, estimate, effort)
+    reason = None if paths else why_no_strokes(scene, height, goal)
+    return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason)
 
 
 def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
