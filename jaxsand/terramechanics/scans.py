@@ -14,6 +14,7 @@ import numpy as np
 
 Reference = Callable[[np.ndarray], np.ndarray]
 COLUMNS = ("beta_deg", "sinkage_mm", "scan", "x_mm", "z_mm")
+_GIVE = f"give a CSV file of scans, whose first line names the columns {', '.join(COLUMNS)}"
 STEP, GAP, MARGIN = 0.0005, 0.005, 0.01  # m: between samples; wider ones are left out; on either side of the toes
 _SMALL = (np.nan, np.nan, 1.196, 1.495, 1.363, 1.206, 1.2, 1.14, 1.129, 1.107)  # MAD of n (Croux & Rousseeuw 1992)
 
@@ -69,7 +70,7 @@ def read_scans(path: str | Path, no_data: float | None = None) -> dict[tuple[flo
       Lists of scans by trench (beta_deg, sinkage_mm), rising.
 
     Raises:
-      ValueError: if the file cannot be read; names the line and what is wrong.
+      ValueError: if the file cannot be read; names the file, the line, the column, what is wrong and what to give.
     """
     table, scans = _table(path, no_data), dict[tuple[float, float], list[Scan]]()
     for beta, sinkage, number in np.unique(table[:, :3], axis=0).tolist():
@@ -77,9 +78,10 @@ def read_scans(path: str | Path, no_data: float | None = None) -> dict[tuple[flo
         x, z, line = rows[np.isfinite(rows[:, 4]), 3:].T
         name = f"scan {number:g} of beta {beta:g}, sinkage {sinkage:g} (from line {rows[:, 5].min():.0f})"
         if x.size < 20:
-            raise ValueError(f"measured: {name} has {x.size} points with a height; give at least 20")
+            raise ValueError(f"measured: {path}: {name} has {x.size} points with a height; give at least 20")
         for i in np.flatnonzero(np.diff(x) == 0)[:1]:
-            raise ValueError(f"measured: {name} has x_mm {x[i]:g} in lines {line[i]:.0f}, {line[i + 1]:.0f}; give it once")
+            twice = f"x_mm {x[i]:g} in lines {line[i]:.0f}, {line[i + 1]:.0f}"
+            raise ValueError(f"measured: {path}: {name} has {twice}; give it once")
         scans.setdefault((beta, sinkage), []).append(Scan(int(number), x / 1000, z / 1000, len(rows) - x.size))
     return scans
 
@@ -209,26 +211,33 @@ def _table(path: str | Path, no_data: float | None) -> np.ndarray:
     try:
         text = Path(path).read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
-        raise ValueError(f"measured: cannot read {path} ({error.strerror}); give a CSV file of scans") from None
+        raise ValueError(f"measured: cannot read {path} ({error.strerror}); {_GIVE}") from None
+    if "\0" in text:
+        raise ValueError(f"measured: {path} is no text in UTF-8; {_GIVE}")
     lines = [(i, s) for i, s in enumerate(text.split("\n"), 1) if s.strip(' \t,;"') and not s.lstrip(' "').startswith("#")]
-    head, header = lines[0] if lines else (1, "")
+    if not lines:
+        raise ValueError(f"measured: {path} is empty; {_GIVE}")
+    head, header = lines[0]
     sign = next((s for s in ";\t" if s in header), ",")
     names = [name.strip(' "').lower() for name in header.split(sign)]
     for name in COLUMNS:
         if (many := names.count(name)) != 1:
-            raise ValueError(f"measured: {many} columns {name} in line {head}, the header; give {', '.join(COLUMNS)}")
+            raise ValueError(f"measured: {path}: {many or 'no'} columns {name} in line {head}, the header; {_GIVE}")
     rows = []
     for line, text in lines[1:]:
         fields = [field.strip(' "').replace(",", ".") for field in text.split(sign)]
         if len(fields) != len(names):
-            raise ValueError(f"measured: {len(fields)} fields in line {line}, {len(names)} in the header; give as many")
-        rows.append([_number(fields[names.index(name)], name, line, no_data) for name in COLUMNS] + [line])
+            many = f"{len(fields)} fields in line {line}, {len(names)} in the header"
+            raise ValueError(f"measured: {path}: {many}; give as many")
+        rows.append(
+            [_number(fields[names.index(name)], name, f"line {line} of {path}", no_data) for name in COLUMNS] + [line]
+        )
     if not rows:
         raise ValueError(f"measured: no rows below line {head} of {path}; give one for each point of a scan")
     return np.array(sorted(rows, key=lambda row: row[3]))
 
 
-def _number(text: str, name: str, line: int, no_data: float | None) -> float:
+def _number(text: str, name: str, where: str, no_data: float | None) -> float:
     try:
         value = float(text or "nan")
     except ValueError:
@@ -237,5 +246,5 @@ def _number(text: str, name: str, line: int, no_data: float | None) -> float:
         return math.nan
     if not (abs(value) <= 1000 or (math.isnan(value) and name == "z_mm")) or (name == "scan" and value % 1):
         remedy = "a whole number" if name == "scan" else "degrees, or millimetres up to 1000 and nan for drop-outs"
-        raise ValueError(f"measured: {name} is {text!r} in line {line}; give {remedy}")
+        raise ValueError(f"measured: {name} is {text!r:.60} in {where}; give {remedy}")
     return value

@@ -296,31 +296,35 @@ def test_reading_ways_to_write_the_same(tmp_path, lines, end):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ([], "measured: 0 columns beta_deg in line 1, the header; give beta_deg"),
-        ([HEADER.replace("z_mm", "z"), *ROWS], "measured: 0 columns z_mm in line 1, the header; give"),
-        (["#", HEADER + ",scan", *ROWS], "measured: 2 columns scan in line 2, the header; give"),
-        (["", HEADER], "measured: no rows below line 2 of .*; give one for each point"),
-        ([HEADER, *ROWS, "22.5,5,1,x,0"], "measured: x_mm is 'x' in line 27; give degrees, or millimetres"),
-        ([HEADER, *ROWS, "22.5,5,1,nan,0"], "measured: x_mm is 'nan' in line 27; give"),
-        ([HEADER, *ROWS, "22.5,5,1,30,-9999"], "measured: z_mm is '-9999' in line 27; give .* nan for drop-outs"),
-        ([HEADER, *ROWS, "22.5,5,1,30,inf"], "measured: z_mm is 'inf' in line 27; give"),
-        ([HEADER, *ROWS, ",5,1,30,0"], "measured: beta_deg is '' in line 27; give"),
-        ([HEADER, *ROWS, "22.5,5,1.5,30,0"], "measured: scan is '1.5' in line 27; give a whole number"),
-        ([HEADER, *ROWS, "22.5,5,1,30"], "measured: 4 fields in line 27, 5 in the header; give as many"),
+        ([], "measured: FILE is empty; give a CSV file of scans, whose first line names the columns beta_deg, .* z_mm"),
+        ([HEADER.replace("z_mm", "z"), *ROWS], "measured: FILE: no columns z_mm in line 1, the header; give"),
+        (["A walk on the beach", "and back"], "measured: FILE: no columns beta_deg in line 1, the header; give a CSV"),
+        ([HEADER, *ROWS, "22.5,5,1,30,deep"], "measured: z_mm is 'deep' in line 27 of FILE; give degrees, or millimetres"),
+        (["#", HEADER + ",scan", *ROWS], "measured: FILE: 2 columns scan in line 2, the header; give"),
+        (["", HEADER], "measured: no rows below line 2 of FILE; give one for each point"),
+        ([HEADER, *ROWS, "22.5,5,1,x,0"], "measured: x_mm is 'x' in line 27 of FILE; give degrees, or millimetres"),
+        ([HEADER, *ROWS, "22.5,5,1,nan,0"], "measured: x_mm is 'nan' in line 27 of FILE; give"),
+        ([HEADER, *ROWS, "22.5,5,1,30,-9999"], "measured: z_mm is '-9999' in line 27 of FILE; give .* nan for drop-outs"),
+        ([HEADER, *ROWS, "22.5,5,1,30,inf"], "measured: z_mm is 'inf' in line 27 of FILE; give"),
+        ([HEADER, *ROWS, ",5,1,30,0"], "measured: beta_deg is '' in line 27 of FILE; give"),
+        ([HEADER, *ROWS, "22.5,5,1.5,30,0"], "measured: scan is '1.5' in line 27 of FILE; give a whole number"),
+        ([HEADER, *ROWS, "22.5,5,1,30"], "measured: FILE: 4 fields in line 27, 5 in the header; give as many"),
         (
             [HEADER, *ROWS, "22.5,5,1,3.0,1"],
-            "measured: scan 1 of beta 22.5, sinkage 5 .* has x_mm 3 in lines 5, 27; give it once",
+            "measured: FILE: scan 1 of beta 22.5, sinkage 5 .* has x_mm 3 in lines 5, 27; give it once",
         ),
         (
             [HEADER, *ROWS, "22.5,5,2,3.0,1"],
-            "measured: scan 2 of .* .from line 27. has 1 points with a height; give at least 20",
+            "measured: FILE: scan 2 of .* .from line 27. has 1 points with a height; give at least 20",
         ),
-        ([HEADER, *(r[: r.rindex(",") + 1] for r in ROWS)], "measured: scan 1 of .* has 0 points with a height; give"),
+        ([HEADER, *(r[: r.rindex(",") + 1] for r in ROWS)], "measured: FILE: scan 1 of .* has 0 points with a height; give"),
     ],
 )
 def test_mistakes_in_a_file_are_told_with_their_line(tmp_path, lines, message):
-    with pytest.raises(ValueError, match=message):
-        scans.read_scans(written(tmp_path, lines))
+    file = written(tmp_path, lines)
+    with pytest.raises(ValueError, match=message.replace("FILE", str(file))) as told:
+        scans.read_scans(file)
+    assert "\n" not in str(told.value)
 
 
 def test_mistakes_of_other_kinds_are_told(tmp_path):
@@ -329,7 +333,9 @@ def test_mistakes_of_other_kinds_are_told(tmp_path):
             scans.read_scans(path)
     picture = tmp_path / "picture.csv"
     picture.write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match="measured: 0 columns"):
+    with pytest.raises(
+        ValueError, match="measured: .*picture.csv is no text in UTF-8; give a CSV file of scans, whose first"
+    ):
         scans.read_scans(picture)
     with pytest.raises(ValueError, match="measured: got no scans"):
         scans.measured_profile([], section(0.01, 0, 0))
@@ -346,5 +352,5 @@ def test_heights_without_data_are_drop_outs(tmp_path):
     (scan,) = scans.read_scans(tmp_path / "scans.csv", -9999)[0, 5]
     assert (scan.dropouts, scan.x.size) == (2, 23)
     assert not scan.z.any()
-    with pytest.raises(ValueError, match="z_mm is '-9999' in line 5"):
+    with pytest.raises(ValueError, match="z_mm is '-9999' in line 5 of"):
         scans.read_scans(tmp_path / "scans.csv")

@@ -140,6 +140,8 @@ def test_the_command(tmp_path, monkeypatch, capsys):
         (["--spacing-mm", "nan"], "spacing-mm: got nan"),
         (["--rule", "other"], "rule: invalid choice"),
         (["--measured", "none.csv"], "measured: cannot read none.csv"),
+        (["--measured", "heights.npy"], "measured: heights.npy is no text in UTF-8; give a CSV file of scans"),
+        (["--measured", "short.csv"], "measured: short.csv: no columns sinkage_mm in line 1, the header; give a CSV"),
         (["--measured", "deep.csv"], "measured: got a trench of beta 45 degrees, sinkage 80 mm"),
         (["--out", ""], "out: got an empty name"),
         (["--out", "taken"], "out: cannot write taken/trench.png, which is a folder"),
@@ -149,6 +151,8 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 def test_bad_input(tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     points = "".join(f"45,80,1,{x},0\n" for x in range(30))
+    np.save(tmp_path / "heights.npy", np.zeros((3, 3)))
+    (tmp_path / "short.csv").write_text("beta_deg,z_mm\n0,1\n")
     (tmp_path / "taken" / "trench.png").mkdir(parents=True)
     (tmp_path / "deep.csv").write_text("beta_deg,sinkage_mm,scan,x_mm,z_mm\n" + points)
     try:
