@@ -93,6 +93,7 @@ class Calibration(Generic[Model]):
       calls: how many times the model was run.
       verdict: what is wrong with the result; `Verdict(0)` if nothing.
       model: the model with the values put in: a `Scene`, or a tuple of wheel passes.
+      converged: whether the best start had come to rest.
 
     Example:
       >>> import math

@@ -22,6 +22,8 @@ class Plan:
       expanded: how many states the search took up.
       opened: how many children it looked at.
       engine: the name of the search.
+      start: the first of the cells.
+      gap: how far the cost can be above the least, as a share of the lower bound; 0 where the walk is proven.
 
     Example:
       >>> import numpy as np
