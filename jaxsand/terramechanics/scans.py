@@ -227,8 +227,8 @@ def _table(path: str | Path, no_data: float | None) -> np.ndarray:
     for line, text in lines[1:]:
         fields = [field.strip(' "').replace(",", ".") for field in text.split(sign)]
         if len(fields) != len(names):
-            many = f"{len(fields)} fields in line {line}, {len(names)} in the header"
-            raise ValueError(f"measured: {path}: {many}; give as many")
+            counts = f"{len(fields)} fields in line {line}, {len(names)} in the header"
+            raise ValueError(f"measured: {path}: {counts}; give as many")
         rows.append(
             [_number(fields[names.index(name)], name, f"line {line} of {path}", no_data) for name in COLUMNS] + [line]
         )
