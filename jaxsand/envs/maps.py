@@ -11,7 +11,7 @@ from jax import lax
 
 from jaxsand.planning.binary import Cell, make_problem, plan
 from jaxsand.planning.binary.board import MOVES
-from jaxsand.scene.masked import unmasked
+from jaxsand.scene.masked import DIG, unmasked
 
 STEPS = np.array([*MOVES.values()], np.int32)
 """The changes of row and column by a step north, east, south and west, [4, 2]."""
@@ -136,7 +136,7 @@ def map_pool(maps: Sequence[np.ndarray] | np.ndarray, starts: Sequence[Cell | No
       >>> js.env.map_pool([np.ones((2, 3), bool)], starts=[(0, 1)]).starts.tolist()
       [[0, 1]]
     """
-    maps = [np.asarray(unmasked("maps", dig), bool) for dig in maps]
+    maps = [np.asarray(unmasked("maps", dig, DIG), bool) for dig in maps]
     if not maps or len({dig.shape for dig in maps}) > 1:
         raise ValueError(f"maps: got shapes {[list(dig.shape) for dig in maps][:4]}; give one or more maps of one shape")
     starts = [None] * len(maps) if starts is None else starts

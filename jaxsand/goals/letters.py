@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsand.scene.masked import gaps, unmasked
+from jaxsand.scene.masked import POINTS, gaps, unmasked
 
 Cell = tuple[int, int]
 
@@ -29,7 +29,7 @@ def stroke_list(field: str, name: object, strokes: object, low: float = -math.in
       ValueError: names the field, the glyph and the stroke, unless there is at least one stroke, all of finite numbers from
         `low` to `high`.
     """
-    strokes = unmasked(field, strokes)
+    strokes = unmasked(field, strokes, POINTS)
     try:
         found = np.array(strokes)
     except (TypeError, ValueError, OverflowError):

@@ -23,6 +23,7 @@ from jaxsand.relaxation.batching import in_groups, in_turns, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
 from jaxsand.relaxation.stopping import Outcome, Stop, as_batch, check_chunk
+from jaxsand.scene.masked import POINTS
 from jaxsand.scene.scene import Scene, as_array
 from jaxsand.scene.window import Whole
 
@@ -153,7 +154,7 @@ def _batch(
     args: tuple[Tree, ...] = (),
 ) -> Tree:
     height = as_batch(height)
-    stroke = as_array("stroke", stroke, height.dtype)
+    stroke = as_array("stroke", stroke, height.dtype, POINTS)
     if stroke.shape != (height.shape[0], 4):
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; give [{height.shape[0]}, 4], one stroke for each map")
     check_chunk(chunk)

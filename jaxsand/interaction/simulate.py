@@ -20,6 +20,7 @@ from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Multilevel, Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule
+from jaxsand.scene.masked import POINTS
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import Pose
 from jaxsand.scene.window import Whole, Window
@@ -264,7 +265,7 @@ def rollout(
         (2, 8, 8)
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
-    strokes = as_array("strokes", strokes, height.dtype)
+    strokes = as_array("strokes", strokes, height.dtype, POINTS)
     if strokes.ndim != 2 or strokes.shape[1] != 4:
         raise ValueError(f"strokes: got shape {list(strokes.shape)}; give [n, 4], a row x0, y0, x1, y1 for each push")
     return _as_needed(lambda scene, _: _rollout(scene, height, strokes, rules), scene, rules, (height, strokes))
@@ -330,7 +331,7 @@ def ready(
 
 def _stroke(stroke: ArrayLike, dtype: DTypeLike) -> Float[Array, "2 2"]:
     """The stroke's start and end as a path; ValueError if it has the wrong shape."""
-    stroke = as_array("stroke", stroke, dtype)
+    stroke = as_array("stroke", stroke, dtype, POINTS)
     if stroke.shape != (4,):
         remedy = "use jax.vmap" if stroke.ndim > 1 and stroke.shape[-1] == 4 else "give x0, y0, x1, y1 in metres"
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
@@ -338,7 +339,7 @@ def _stroke(stroke: ArrayLike, dtype: DTypeLike) -> Float[Array, "2 2"]:
 
 
 def _path(path: ArrayLike, dtype: DTypeLike) -> Float[Array, "n 2"]:
-    path = as_array("path", path, dtype)
+    path = as_array("path", path, dtype, POINTS)
     if path.ndim != 2 or path.shape[0] < 2 or path.shape[1] != 2:
         remedy = "use jax.vmap" if path.ndim > 2 else "give at least two points [n, 2] of x, y in metres"
         raise ValueError(f"path: got shape {list(path.shape)}; {remedy}")

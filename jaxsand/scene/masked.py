@@ -8,6 +8,10 @@ from typing import Any
 
 import numpy as np
 
+BED = "fill them first (cells of a bed that hold no sand are walls: make_scene(..., walls=Walls(solid)))"
+DIG = "say of each whether to dig it: dig.filled(False), or True"
+POINTS = "give every coordinate, and leave out a stroke or a point of which one is not known"
+
 
 def gaps(value: Any) -> Any:
     """The value, in floats with NaN ("no data") in the masked cells where it is a masked array, or a list of such."""
@@ -17,14 +21,11 @@ def gaps(value: Any) -> Any:
     return np.ma.filled(masked.astype(np.result_type(masked.dtype, np.float32)), np.nan)
 
 
-def unmasked(name: str, value: Any) -> Any:
-    """The value, without the mask of a masked array; a ValueError if any cell is masked."""
+def unmasked(name: str, value: Any, remedy: str = BED) -> Any:
+    """The value, without the mask of a masked array; a ValueError with the remedy if any cell is masked."""
     masked = _masked(value)
     if masked is not None:
-        raise ValueError(
-            f"{name}: got {int(np.ma.getmaskarray(masked).sum())} masked cells; fill them first "
-            "(cells of a bed that hold no sand are walls: make_scene(..., walls=Walls(solid)))"
-        )
+        raise ValueError(f"{name}: got {int(np.ma.getmaskarray(masked).sum())} masked cells; {remedy}")
     return _plain(value)
 
 

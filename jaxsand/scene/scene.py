@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxsand.scene.boundaries import Closed, Draining, Open, Walls
 from jaxsand.scene.grid import Grid, Neighbours
-from jaxsand.scene.masked import unmasked
+from jaxsand.scene.masked import BED, unmasked
 from jaxsand.scene.material import DRY_SAND, Material
 from jaxsand.scene.tools import Blade, NoTool, Tool
 from jaxsand.scene.validation import concrete, finite, positive
@@ -104,6 +104,7 @@ def make_scene(
     """
     shape = _shape(shape)
     positive("spacing", spacing, "give the distance of cell centres in metres, such as 0.01")
+    repose_angle = unmasked("repose_angle", repose_angle, "give every cell an angle, such as angle.filled(angle.mean())")
     _angle(repose_angle, shape)
     known = neighbours == "isotropic" if isinstance(neighbours, str) else isinstance(neighbours, int | np.integer)
     if not known or neighbours not in (4, 8, "isotropic"):
@@ -191,9 +192,11 @@ def check_scene(scene: object) -> None:
         raise ValueError(f"scene: got {type(scene).__name__}; give make_scene(shape, spacing)")
 
 
-def as_array(name: str, value: ArrayLike | npt.ArrayLike, dtype: DTypeLike | None = None) -> jax.Array:
-    """The value as an array; raises a ValueError that bears the name if it is none, or has masked cells."""
-    value = unmasked(name, value)
+def as_array(name: str, value: ArrayLike | npt.ArrayLike, dtype: DTypeLike | None = None, masked: str = BED) -> jax.Array:
+    """The value as an array; raises a ValueError that bears the name if it is none, or has cells that are masked, for which
+    `masked` is the remedy.
+    """
+    value = unmasked(name, value, masked)
     try:
         return jnp.asarray(value, dtype)
     except (TypeError, ValueError) as error:
@@ -243,7 +246,7 @@ def _angle(angle: object, shape: tuple[int, int]) -> None:
 def _as_walls(walls: Open | Walls) -> Open | Walls:
     if not isinstance(walls, Walls):
         return walls
-    solid = unmasked("walls.solid", walls.solid)
+    solid = unmasked("walls.solid", walls.solid, "say of each whether it is solid: solid.filled(True), or False")
     return Walls(solid if hasattr(solid, "dtype") else jnp.asarray(solid))
 
 

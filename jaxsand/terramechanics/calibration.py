@@ -18,7 +18,7 @@ from jaxsand.interaction.simulate import check_push, rollout
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import Stop, check_rule, check_whole
-from jaxsand.scene.masked import gaps, unmasked
+from jaxsand.scene.masked import POINTS, gaps, unmasked
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, fit
 from jaxsand.scene.tools import NoTool
@@ -269,7 +269,7 @@ def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
         except ValueError as error:
             raise ValueError(str(error).replace("height:", "before:", 1)) from None
         after = as_array("after", gaps(trial.after), dtype)
-        strokes = jnp.zeros((0, 4), dtype) if trial.stroke is None else as_array("stroke", trial.stroke, dtype)
+        strokes = jnp.zeros((0, 4), dtype) if trial.stroke is None else as_array("stroke", trial.stroke, dtype, POINTS)
         if strokes.shape != (4,) and (strokes.ndim != 2 or strokes.shape[1] != 4):
             raise ValueError(f"stroke: got shape {list(strokes.shape)}; give x0, y0, x1, y1, rows of these, or None")
         if strokes.size and isinstance(scene.tool, NoTool):
@@ -289,7 +289,7 @@ def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
 def _labels(scene: Scene, regions: ArrayLike | jax.Array | None) -> np.ndarray | None:
     if regions is None:
         return None
-    labels = np.asarray(unmasked("regions", regions))
+    labels = np.asarray(unmasked("regions", regions, "give every cell a region, such as regions.filled(0)"))
     if labels.dtype.kind not in "iu" or labels.shape != scene.grid.shape:
         got = f"{labels.dtype} of shape {list(labels.shape)}"
         raise ValueError(f"regions: got {got}; give whole numbers of shape {list(scene.grid.shape)}")

@@ -9,7 +9,7 @@ from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
-from jaxsand.scene.masked import unmasked
+from jaxsand.scene.masked import DIG, unmasked
 
 MOVES = {"N": (-1, 0), "E": (0, 1), "S": (1, 0), "W": (0, -1)}
 Cell = tuple[int, int]
@@ -76,7 +76,7 @@ def make_problem(dig: ArrayLike, start: ArrayLike | None = None, end: Cell | Non
       ValueError: for a map that is empty or falls into pieces (it names them), a start or end that is not a cell to dig, or
         a cost below 0.
     """
-    dig = unmasked("map", dig)
+    dig = unmasked("map", dig, DIG)
     try:
         dig = np.asarray(dig)
     except ValueError:
@@ -109,7 +109,7 @@ def make_problem(dig: ArrayLike, start: ArrayLike | None = None, end: Cell | Non
 
 def _several(field: str, start: ArrayLike) -> list[Cell]:
     """A user's cell or cells as a list."""
-    given = np.asarray(start)
+    given = np.asarray(unmasked(field, start, "give (row, column) of a cell to dig"))
     if given.ndim not in (1, 2) or given.shape[-1] != 2 or not given.size or given.dtype.kind not in "iu":
         raise ValueError(f"{field}: got {start!r}; give (row, column) of a cell to dig")
     return [tuple(cell) for cell in given.reshape(-1, 2).tolist()]

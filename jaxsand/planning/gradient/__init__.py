@@ -18,7 +18,7 @@ from jaxsand.planning.gradient.sketch import Print, guesses
 from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.stroke_loss import Best, SandLoss, pushed
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.scene.masked import gaps
+from jaxsand.scene.masked import POINTS, gaps
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, as_array, blade_of
 
@@ -240,7 +240,7 @@ def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Ge
 
 def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:
     """A user's guess as an array [N, 4]."""
-    plan = np.asarray(as_array("guess", guess), float)
+    plan = np.asarray(as_array("guess", guess, masked=POINTS), float)
     if plan.ndim != 2 or plan.shape[1] != 4 or strokes not in (None, len(plan)) or not np.isfinite(plan).all():
         raise ValueError(f"guess: got shape {list(plan.shape)}; give [{strokes or 'N'}, 4], finite x0, y0, x1, y1 in metres")
     return plan
