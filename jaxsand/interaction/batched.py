@@ -105,8 +105,8 @@ def value_and_grad_batch(
 
     Args:
         scene: the scene of all maps, with the tool.
-        loss: a function of a settled map [H, W] (m) and of its part of `args` that returns a scalar. Pass the same function
-            in every call: each new one is compiled anew, which takes a quarter of a minute.
+        loss: a function of a settled map [H, W] (m) and of its part of `args` that returns one floating-point number. Pass
+            the same function in every call: each new one is compiled anew, which takes a quarter of a minute.
         height: height maps [B, H, W] (m) before the pushes.
         stroke: one stroke [4] = x0, y0, x1, y1 (m) for each map, [B, 4].
         *args: arrays, or pytrees of arrays, with a leading axis of length B: such as one goal for each map.
@@ -120,7 +120,8 @@ def value_and_grad_batch(
         outcome is NOT_FINITE, or where sand reached the edge of a `Window` that the scene was given.
 
     Raises:
-        ValueError: as of `step_batch`.
+        ValueError: as of `step_batch`, or the loss is no hashable function, or returns anything but one
+            floating-point number for a map, or `args` do not have the batch axis.
 
     Example:
         The distance to a goal; here of a scene without a tool, which compiles faster.
@@ -135,9 +136,15 @@ def value_and_grad_batch(
         >>> losses.tolist(), by_height[0, 0, 0].tolist(), by_stroke.shape
         ([64.0, 64.0], -2.0, (2, 4))
     """
+    _check_loss(loss)
+    height = as_batch(height)
+    args = jax.tree.map(lambda x: as_array("args", x, masked="fill them first, or have the loss leave them out"), args)
+    for arg in jax.tree.leaves(args):
+        if arg.shape[:1] != height.shape[:1]:
+            remedy = f"give [{height.shape[0]}, ...], one for each map"
+            raise ValueError(f"args: got an array of shape {list(arg.shape)}; {remedy}")
     program = _gradient_program(loss)
     chunk = _GRADIENTS if chunk is None and jax.default_backend() == "cpu" else chunk
-    args = jax.tree.map(jnp.asarray, args)
     value, *slopes, outcome = _batch(program, scene, height, stroke, (push, scheme, stop), chunk, args)
     clean = np.asarray(outcome) & (Outcome.NOT_FINITE | Outcome.WINDOW_EDGE) == 0
     value, by_height, by_stroke = (jnp.where(clean.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan) for x in (value, *slopes))
@@ -208,9 +215,31 @@ def _gradient_program(loss: Loss) -> Callable[[Scene, Rules, Batch], tuple[jax.A
 
         def one(height: jax.Array, stroke: jax.Array, args: tuple[Tree, ...]) -> tuple[jax.Array, jax.Array]:
             shaped = step(scene, height, stroke, push=push, scheme=scheme, stop=stop)
-            return loss(shaped.height, *args), shaped.outcome
+            return _one_number(loss(shaped.height, *args)), shaped.outcome
 
         (value, outcome), slopes = jax.vmap(jax.value_and_grad(one, argnums=(0, 1), has_aux=True))(*batch)
         return value, *slopes, outcome
 
     return jax.jit(run, compiler_options=wide_vectors())
+
+
+def _check_loss(loss: object) -> None:
+    """Raises ValueError unless it is a function that finds its compiled program again."""
+    if not callable(loss):
+        raise ValueError(f"loss: got {type(loss).__name__}; give a function of a map [H, W] that returns one number")
+    try:
+        hash(loss)
+    except TypeError as error:
+        raise ValueError(f"loss: got {type(loss).__name__} ({error}); give a function, and what it needs as args") from None
+
+
+def _one_number(value: object) -> jax.Array:
+    """What a loss returned for a map; ValueError unless it is one floating-point number."""
+    remedy = "return one floating-point number for a map, such as jnp.sum((height - goal) ** 2)"
+    try:
+        found = jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"loss: got {type(value).__name__} from it; {remedy}") from None
+    if found.shape or not jnp.issubdtype(found.dtype, jnp.floating):
+        raise ValueError(f"loss: got {found.dtype} of shape {list(found.shape)} from it; {remedy}")
+    return found

@@ -1,6 +1,6 @@
 """Many pushes at once: every map as it would come out alone, its loss and gradient too; what is refused."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -72,6 +72,42 @@ def test_large_maps_are_pushed_in_windows_and_again_where_these_are_too_small():
     want = jax.jit(jax.vmap(partial(js.act, replace(sand, window=js.Whole()))))(maps, strokes)
     assert not np.asarray(found.outcome).any()
     assert np.abs(found.height - want.height).max() < 2e-4
+
+
+@dataclass(frozen=True)
+class Weighed:
+    weight: np.ndarray
+
+    def __call__(self, height, _):
+        return jnp.sum(self.weight * height)
+
+
+BARE = js.make_scene((9, 9), 0.01, 0.5)
+LOSSES = {
+    "a map": (lambda h, w: w * h, r"loss: got float64 of shape \[9, 9\] from it; return one floating-point number"),
+    "a row": (lambda h, w: jnp.sum(w * h, axis=0, keepdims=True)[0, :1], r"loss: got float64 of shape \[1\] from it"),
+    "a count": (lambda h, w: jnp.sum(h > w), r"loss: got int64 of shape \[\] from it; return one floating-point"),
+    "a complex number": (lambda h, w: 1j * jnp.sum(w * h), r"loss: got complex128 of shape \[\] from it"),
+    "two numbers": (lambda h, w: (jnp.sum(h), jnp.sum(w)), r"loss: got float64 of shape \[2\] from it"),
+    "names": (lambda h, w: {"miss": jnp.sum(w * h)}, "loss: got dict from it; return one floating-point number"),
+    "nothing": (lambda h, w: None, "loss: got NoneType from it; return one floating-point number"),
+    "what has no hash": (Weighed(WEIGHTS[0]), r"loss: got Weighed \(unhashable type.*; give a function, and what it needs"),
+    "no function": (0.5, "loss: got float; give a function of a map"),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_loss_that_is_no_number_is_refused(name):
+    loss, message = LOSSES[name]
+    with pytest.raises(ValueError, match=message):
+        js.value_and_grad_batch(BARE, loss, MAPS, STROKES, WEIGHTS, **QUICK)
+
+
+def test_what_a_loss_needs_has_a_part_for_each_map():
+    with pytest.raises(ValueError, match=r"args: got an array of shape \[2, 9, 9\]; give \[5, \.\.\.\], one for each map"):
+        js.value_and_grad_batch(BARE, weighed, MAPS, STROKES, WEIGHTS[:2], **QUICK)
+    with pytest.raises(ValueError, match="args: got 1 masked cells; fill them first"):
+        js.value_and_grad_batch(BARE, weighed, MAPS, STROKES, np.ma.masked_equal(WEIGHTS, WEIGHTS[0, 0, 0]), **QUICK)
 
 
 def test_what_is_refused():
