@@ -17,7 +17,7 @@ from jaxsand.interaction._path import Pushed, Record
 from jaxsand.interaction.blade_stepped import with_near
 from jaxsand.interaction.rule import PushRule
 from jaxsand.interaction.stepped import SteppedPush
-from jaxsand.relaxation.schemes import Multilevel, Scheme
+from jaxsand.relaxation.schemes import Multilevel, Pairwise, Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule
 from jaxsand.scene.masked import POINTS
@@ -213,6 +213,7 @@ def follow_frames(
 
     Raises:
         ValueError: as of `follow`.
+        NotImplementedError: as of `follow`.
 
     Example:
         >>> import jax.numpy as jnp
@@ -289,11 +290,14 @@ def _as_needed(
 
 
 def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
-    """A settling window that holds the path and the blade's window at its ends; Whole() unless the map is much wider."""
+    """A settling window that holds the path and the blade's window at its ends.
+
+    Whole() unless the map is much wider, and for schemes whose result depends on where the map begins.
+    """
     if not path.size:
         return Whole()
     far = float(np.max(np.ptp(np.asarray(path), axis=0))) / float(scene.grid.spacing)
-    if isinstance(scheme, Multilevel) or not isinstance(scene.window, Window) or not far < max(scene.grid.shape):
+    if isinstance(scheme, Pairwise | Multilevel) or not isinstance(scene.window, Window) or not far < max(scene.grid.shape):
         return Whole()
     size = 1 << math.ceil(math.log2(far + 2 * max(scene.window.size)))
     rows, columns = scene.grid.shape

@@ -8,6 +8,7 @@ import pytest
 
 import jaxsand as js
 from jaxsand.goals.metrics import volume_error
+from jaxsand.interaction import simulate
 
 from ..conftest import ANGLE
 
@@ -121,3 +122,13 @@ def test_a_rollout_of_no_strokes_has_no_maps():
 def test_what_is_no_scene_and_no_result_is_named(call, message):
     with pytest.raises(ValueError, match=message):
         call(np.zeros((8, 8)), np.zeros(4))
+
+
+def test_schemes_that_depend_on_where_the_map_begins_settle_the_whole_map():
+    """As of `settle`, which refuses a window for them: pairs and blocks of cells would lie otherwise in it."""
+    scene = js.make_scene((200, 200), 0.01, ANGLE, tool=js.Blade())
+    part = next(simulate.windows_for(scene, js.SteppedPush()))
+    path = np.array([[0.98, 1.0], [1.06, 1.02]])
+    assert isinstance(simulate._around(part, path, js.SuperTimeStepping()), js.Window)
+    for scheme in (js.Pairwise(), js.Multilevel()):
+        assert isinstance(simulate._around(part, path, scheme), js.Whole)
