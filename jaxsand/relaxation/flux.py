@@ -13,10 +13,11 @@ only straight links carry sand:
 
     f_ij = (h_j - h_i) * mean of max(1 - mu / |g|, 0) over the four gradients that contain the link.
 
-Its piles converge to cones as the grid is refined. A link to a missing neighbour (wall, edge) carries nothing.
+Its piles converge to cones as the grid is refined. A link to a missing neighbour (wall, edge) carries nothing. What follows
+from E: notebooks/site/theory/settling.md.
 
-Fluxes are kept as one map for each direction of links, with one row or column more than the map has, so that cell j loses
-the very number that cell i gains.
+Fluxes are kept as one map for each direction of links, so that cell j loses the very number that cell i gains. Links to the
+edge count too: the maps are [H, W + 1] along x, [H + 1, W] along y, and [H + 1, W + 1] on diagonals.
 """
 
 import math
@@ -33,7 +34,7 @@ from jaxsand.relaxation.ghost_cells import Bed, Rim, at, halo
 from jaxsand.scene.grid import Link, Neighbours, links
 
 Fluxes = tuple[jax.Array, ...]
-NARROW = 0.05  # the smallest open share that is divided by: in a narrower one sand stands as high as in this
+NARROW = 0.05  # the smallest open share that is divided by: a cell still less open counts as if it were as open as this
 
 
 @jax.tree_util.register_dataclass
@@ -88,14 +89,15 @@ def stand(cover: Float[Array, "H W"], bottom: Float[Array, ""]) -> Around:
 def fluxes(bed: Bed, around: Nothing | Partial, u: Float[Array, "H+2 W+2"]) -> Fluxes:
     """The flux over every link of a map with ghost cells at rate 1 (m), positive towards the link's first cell.
 
-    Where the edge drains, a last map [H, W] holds what each cell loses over the rim.
+    The map holds heights or, in `Partial` cells, volumes per cell area. Where the edge drains, a last map [H, W] holds what
+    each cell loses over the rim.
     """
     s, gate = (u, None) if isinstance(around, Nothing) else (halo(around.surface(at(u))), around.open)
     return flows(bed, gate, s)
 
 
 def flows(bed: Bed, gate: Float[Array, "H+2 W+2"] | None, s: Float[Array, "H+2 W+2"]) -> Fluxes:
-    """`fluxes` of a surface with ghost cells, where `gate` is the open share of each cell, None where all are whole."""
+    """`fluxes` of the surface `s` (m); `gate` is the open share of each cell, None where all are whole."""
     flow = _isotropic(bed, gate, s) if bed.neighbours == "isotropic" else _pairwise(bed, gate, s)
     if bed.rim is not None:
         out = _over(bed, bed.rim, at(s)) * _draining_sides(bed.rim)
@@ -126,7 +128,7 @@ def fluxes_zero(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Fluxes:
 
 
 def worst_excess(bed: Bed, u: Float[Array, "H+2 W+2"], around: Nothing | Partial | None = None) -> Float[Array, ""]:
-    """The largest slope in excess of repose (a tangent) of a map with ghost cells; 0 when the map is still.
+    """The largest slope in excess of repose (a tangent) of a map with ghost cells; 0 where none exceeds it.
 
     In partial cells an excess counts only as far as it drives sand, so that it is 0 where nothing flows.
     """
@@ -140,7 +142,10 @@ def worst_excess(bed: Bed, u: Float[Array, "H+2 W+2"], around: Nothing | Partial
 
 
 def middle(bed: Bed, u: Float[Array, "H+2 W+2"], tolerance: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Row and column of the middle of the box around all slopes that exceed repose by more than the tolerance."""
+    """Row and column of the middle of the box around all slopes that exceed repose by more than the tolerance (a tangent).
+
+    They are in cells from the map's corner, so that cell (i, j) spans i to i + 1 and j to j + 1.
+    """
     moving: Any = False
     for e in _excesses(bed, None, u):
         moving = moving | (e > tolerance * bed.spacing)
@@ -167,7 +172,10 @@ def _highest(maps: Iterable[jax.Array]) -> jax.Array:
 
 
 def ends(u: Float[Array, "H+2 W+2 ..."], di: int, dj: int) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """The values in the first and the second cell of every link in the direction (di, dj) of a map with ghost cells."""
+    """The values in the first and in the second cell of every link of a map with ghost cells.
+
+    The second cell lies di rows and dj columns from the first; both maps have the shape of the fluxes in that direction.
+    """
     if di == 0:
         return u[1:-1, :-1], u[1:-1, 1:]
     if dj == 0:
@@ -180,7 +188,7 @@ def _pairwise(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
 
 
 def link_flux(bed: Bed, gate: jax.Array | None, s: jax.Array, link: Link) -> jax.Array:
-    """The flux excess / l over every link in one direction."""
+    """The flux excess / l over every link in one direction (m)."""
     di, dj, length = link
     here, there = ends(s, di, dj)
     d, m = there - here, _yield(bed, link)
@@ -201,7 +209,7 @@ def _slopes(bed: Bed, u: jax.Array) -> Iterator[tuple[jax.Array, jax.Array]]:
             yield jnp.abs(at(u, di, dj) - at(u)) * (1 / length), level
         return
     x, y = _steps(u)
-    for gx, gy, m in _triangles(bed, x / bed.spacing, y / bed.spacing):
+    for gx, gy, m in _gradients(bed, x / bed.spacing, y / bed.spacing):
         yield jnp.sqrt(gx * gx + gy * gy) * bed.spacing, m * bed.spacing
 
 
@@ -214,7 +222,7 @@ def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Ar
             yield (slope - level) * jnp.minimum(at(gate), at(gate, di, dj))
     else:
         x, y = _steps(u)
-        for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
+        for (gx, gy, m), (ox, oy) in zip(_gradients(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
             along_x = jnp.abs(gx) * ox * share_beyond(gx * gx + oy * gy * gy, m)
             along_y = jnp.abs(gy) * oy * share_beyond(ox * gx * gx + gy * gy, m)
             e = jnp.sqrt(gx * gx + gy * gy) - m  # in whole cells at most sqrt(2) times the larger
@@ -222,9 +230,9 @@ def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Ar
 
 
 def _arms(gate: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-    """The open shares of the two links of each of the four gradients; see `_triangles`."""
+    """The open shares [H, W] of the two links of each of the four gradients, in the order of `_gradients`."""
     x, y = (jnp.minimum(*ends(gate, di, dj)) for di, dj, _ in links(4))
-    return [(_ends_x(x)[i], _ends_y(y)[j]) for i in (0, 1) for j in (0, 1)]
+    return [(_west_east(x)[i], _south_north(y)[j]) for i in (0, 1) for j in (0, 1)]
 
 
 def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
@@ -232,16 +240,17 @@ def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
     x, y = _steps(s)
     weights = []
     if gate is None:
-        for gx, gy, m in _triangles(bed, x / bed.spacing, y / bed.spacing):
+        for gx, gy, m in _gradients(bed, x / bed.spacing, y / bed.spacing):
             w = share_beyond(gx * gx + gy * gy, m)
             weights.append((w, w))
         opening = None
     else:  # in the gradient of one link the other link counts as far as it is open
         opening = tuple(jnp.minimum(*ends(gate, di, dj)) for di, dj, _ in links(4))
-        for (gx, gy, m), (ox, oy) in zip(_triangles(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
+        for (gx, gy, m), (ox, oy) in zip(_gradients(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
             weights.append((share_beyond(gx * gx + oy * gy * gy, m), share_beyond(ox * gx * gx + gy * gy, m)))
-    (ww, sw), (wn, nw), (es, se), (en, ne) = weights  # by the arm along x (west, east), then along y (south, north)
-    west, east, south, north = lax.optimization_barrier((ww + wn, es + en, sw + se, nw + ne))
+    # In the order of `_gradients`: in the gradient west-north, `wn` weights the west link and `nw` the north one.
+    (ws, sw), (wn, nw), (es, se), (en, ne) = weights
+    west, east, south, north = lax.optimization_barrier((ws + wn, es + en, sw + se, nw + ne))
     column, row = jnp.zeros_like(west[:, :1]), jnp.zeros_like(west[:1])
     over_x = x * ((lax.concatenate([column, east], 1) + lax.concatenate([west, column], 1)) / 4)
     over_y = y * ((lax.concatenate([row, north], 0) + lax.concatenate([south, row], 0)) / 4)
@@ -260,7 +269,7 @@ def share_beyond(square: jax.Array, m: jax.Array) -> jax.Array:
 
 
 def _steps(u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The steps over the links along x [H, W + 1] and y [H + 1, W]; 0 where one end holds no sand."""
+    """The steps over the links along x [H, W + 1] and y [H + 1, W] (m); 0 where one end holds no sand."""
     steps = []
     for di, dj, _ in links(4):
         here, there = ends(u, di, dj)
@@ -269,18 +278,21 @@ def _steps(u: jax.Array) -> tuple[jax.Array, jax.Array]:
     return steps[0], steps[1]
 
 
-def _ends_x(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _west_east(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What the map x [H, W + 1] of links holds for the link to the west and for that to the east of each cell, [H, W]."""
     return x[:, :-1], x[:, 1:]
 
 
-def _ends_y(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _south_north(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What the map y [H + 1, W] of links holds for the link to the south and for that to the north of each cell, [H, W]."""
     return y[:-1], y[1:]
 
 
-def _triangles(bed: Bed, x: jax.Array, y: jax.Array) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
-    """The four one-sided gradients (x, y) of every cell, and the largest stable length of each.
+def _gradients(bed: Bed, x: jax.Array, y: jax.Array) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
+    """The four one-sided gradients (gx, gy) of every cell and the largest stable length of each, as maps [H, W] of tangents.
 
-    Their order is west-south, west-north, east-south, east-north.
+    Their order is west-south, west-north, east-south, east-north. x and y are the slopes over the links, with the shapes of
+    `_steps`.
     """
     mu = bed.drop / bed.spacing
     if mu.ndim:
@@ -288,15 +300,15 @@ def _triangles(bed: Bed, x: jax.Array, y: jax.Array) -> Iterator[tuple[jax.Array
     for i in (0, 1):
         for j in (0, 1):
             if mu.ndim:  # the mean of its two links, or the one there is
-                mx, my = _ends_x(hx)[i], _ends_y(hy)[j]
+                mx, my = _west_east(hx)[i], _south_north(hy)[j]
                 m = (jnp.where(jnp.isnan(mx), my, mx) + jnp.where(jnp.isnan(my), mx, my)) / 2
             else:
                 m = mu
-            yield _ends_x(x)[i], _ends_y(y)[j], m
+            yield _west_east(x)[i], _south_north(y)[j], m
 
 
 def _yield(bed: Bed, link: Link) -> jax.Array:
-    """The largest stable step over every link in one direction."""
+    """The largest stable step over every link in one direction (m)."""
     di, dj, length = link
     if not bed.drop.ndim:
         return bed.drop * length
