@@ -21,10 +21,8 @@ from jaxsand.scene.grid import links
 Sand: TypeAlias = tuple[jax.Array, Lost]  # a map with ghost cells, and what it lost over the rim
 State: TypeAlias = Sand | tuple[jax.Array, Lost, Fluxes]
 Rate: TypeAlias = jax.Array | float
-Limits: TypeAlias = tuple[jax.Array, jax.Array]  # the tolerance, and the slope per quantum that floats can still move
+Limits: TypeAlias = tuple[jax.Array, jax.Array]  # see `still`
 Params: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, *tuple[Rate, ...]]
-
-
 Swept: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, Rate]
 
 
@@ -49,7 +47,7 @@ class March:
     interval: int
 
     def run(self, groups: int, sand: Sand) -> tuple[Sand, jax.Array]:
-        """The sand after at most so many groups, and the number of sweeps."""
+        """The sand after at most `groups` groups, and the number of sweeps that it took."""
         state, taken = repeat_until(self.done, self.body, groups, self.params, self.begin(sand))
         return (state[0], state[1]), taken * self.interval
 
@@ -63,7 +61,8 @@ def march(
 ) -> March:
     """The loop of a scheme on this bed; without a tolerance it runs to its bound.
 
-    Each group cuts fluxes to quanta of the heights that are left, so that a spike that wears off does not leave rough sand.
+    The quantum of the fluxes is chosen anew for each group, from the largest height before it. So the quantum becomes finer
+    as a spike wears off, and the sand ends smooth.
     """
     begin: Callable[[Sand], State]
     body: Step
@@ -84,7 +83,7 @@ def march(
         done, between = _still, _always
     if tolerance is None:
         done = _never
-    else:  # below this slope every flux is cut to nothing
+    else:  # over the rim flows at least 1/2 of rate * excess * spacing (`Pairwise`: 1/4), over links all of it
         quanta = 4 if isinstance(scheme, Pairwise) and bed.rim is not None else 2
         limits = (tolerance, lax.stop_gradient(quanta / (rate * bed.spacing)))
     params: Params = (bed, around, limits) if isinstance(scheme, Schedule) else (bed, around, limits, rate)
@@ -104,9 +103,12 @@ def _always(k: jax.Array) -> jax.Array:
 
 
 def still(bed: Bed, around: Nothing | Partial, limits: Limits, u: jax.Array) -> jax.Array:
-    """Whether no slope exceeds repose by more than the tolerance, or by more than what floats can still move."""
+    """Whether no slope of a map with ghost cells exceeds repose by more than floats can still move, or than the tolerance.
+
+    The limits are the tolerance (a tangent) and, per quantum (1/m), the excess slope below which fluxes may be cut to 0.
+    """
     tolerance, floor = limits
-    if bed.neighbours == "isotropic":  # the larger part of a gradient moves at least 1/(4 sqrt(2)) of its excess
+    if bed.neighbours == "isotropic":  # the larger component of a gradient moves at least 1/(4 sqrt(2)) of its excess
         floor = 3 * floor
     return worst_excess(bed, u, around) <= jnp.maximum(tolerance, floor * grain(bed, u))
 
@@ -143,7 +145,7 @@ def _pairs(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
 
 
 def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
-    """One sweep of `Pairwise`: in each direction every other pair, then the rest."""
+    """One sweep of `Pairwise`: in each direction every other pair, then the rest; `flow.rate` is half the share."""
     scale = flow.rate / flow.quantum
     for chosen, link in enumerate(links(bed.neighbours)):
         for colour in (0, 1):
