@@ -3,9 +3,9 @@
 All maps share one step number, so that the tape for reverse mode can be written in place.
 
 A step whose attribute `trailing` is true computes a batch by itself. `vmap` then moves the batch to the last axis of all
-arrays, the lanes of the vector unit, for the whole loop. On a CPU it takes no more maps at a time than a core's cache holds,
-and runs maps of like `work` together. Such a step must not change a map that is done, and its `done` returns one boolean for
-all maps.
+arrays, the lanes of the vector unit, for the whole loop. It takes at most `step.together` maps at a time (on a CPU, what a
+core's cache holds), and runs maps of like `step.work(params)` together, a number that grows with a map's steps. Such a step
+must not change a map that is done, and its `done` returns one boolean for all maps.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,21 @@ SPARE = 2  # further states that reverse mode may keep between them
 
 
 @dataclass(frozen=True)
-class Lanes:
-    """A loop whose state has `lanes` leading batch axes, run in lockstep; `width` is the size of a trailing batch, or 0."""
+class Loop:
+    """A loop, run in lockstep for all maps of a batch, to which `vmap` may add axes.
+
+    Attributes:
+        done: whether a map stops before step k; None where all take `bound` steps.
+        step: a `while_loop.Step`.
+        bound: largest number of steps.
+        batch_axes: number of leading batch axes of the state.
+        width: size of the trailing batch, 0 where there is none.
+    """
 
     done: Done | None
     step: Any
     bound: int
-    lanes: int
+    batch_axes: int
     width: int = 0
 
     @property
@@ -43,21 +51,21 @@ class Lanes:
         """The number of records that the tape holds."""
         return max(1, min(self.bound, self.step.tape))
 
-    def over(self, axes: Tree) -> "Lanes":
+    def over(self, axes: Tree) -> "Loop":
         """The loop with one more leading batch axis: of the state, and of the params whose entry in `axes` is 0."""
         done = None if self.done is None else jax.vmap(self.done, in_axes=(axes, None, 0))
-        return Lanes(done, _Many(self.step, axes), self.bound, self.lanes + 1)
+        return Loop(done, _Many(self.step, axes), self.bound, self.batch_axes + 1)
 
     def ready(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
-        """Which lanes stop before step k."""
+        """Which maps stop before step k: booleans with the leading batch axes, one for a whole trailing batch."""
         over = k >= self.bound
         return over if self.done is None else over | self.done(params, k, state)
 
     def taken(self, count: jax.Array) -> jax.Array | None:
-        """The number of steps of each map, or None where it is the bound."""
-        return None if self.done is None else self.said(count)
+        """The number of steps of each map, or None where all take `bound` steps."""
+        return None if self.done is None else self.for_each_map(count)
 
-    def said(self, number: jax.Array) -> jax.Array:
+    def for_each_map(self, number: jax.Array) -> jax.Array:
         """A number that all maps share, repeated for each map of a trailing batch."""
         return jnp.broadcast_to(number[..., None], (*number.shape, self.width)) if self.width else number
 
@@ -66,30 +74,30 @@ class Lanes:
         return jnp.int32(self.bound) if count is None else jnp.max(count)
 
     def beyond(self, k: jax.Array, count: jax.Array | None) -> jax.Array:
-        """The lanes that had stopped before step k."""
+        """Which maps had stopped before step k."""
         return jnp.zeros((), bool) if count is None else k >= count
 
     def keep(self, ready: jax.Array, old: Tree, new: Tree) -> Tree:
-        """The old state in the lanes that are ready, the new one in the others."""
-        if not self.lanes or not ready.ndim:
+        """The old state of the maps that are ready, the new one of the others."""
+        if not self.batch_axes or not ready.ndim:
             return new
         return jax.tree.map(
-            lambda x, y: jnp.where(ready.reshape(ready.shape + (1,) * (x.ndim - self.lanes)), x, y), old, new
+            lambda x, y: jnp.where(ready.reshape(ready.shape + (1,) * (x.ndim - self.batch_axes)), x, y), old, new
         )
 
     def put(self, tape: Tree, k: jax.Array, record: Tree) -> Tree:
-        """The tape with the record in place k."""
-        return jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, k, self.lanes), tape, record)
+        """The tape with the record in place k; a tape's places follow its leading batch axes."""
+        return jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, k, self.batch_axes), tape, record)
 
     def get(self, tape: Tree, k: jax.Array) -> Tree:
         """The record in place k of the tape."""
-        return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, k, self.lanes, keepdims=False), tape)
+        return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, k, self.batch_axes, keepdims=False), tape)
 
     def blank(self, n: int, record: Tree) -> Tree:
         """A tape of n records of zeros."""
 
         def zeros(x: jax.Array) -> jax.Array:
-            return jnp.zeros((*x.shape[: self.lanes], n, *x.shape[self.lanes :]), x.dtype)
+            return jnp.zeros((*x.shape[: self.batch_axes], n, *x.shape[self.batch_axes :]), x.dtype)
 
         return jax.tree.map(zeros, record)
 
@@ -108,7 +116,7 @@ class _Many:
         return self.call(params, k, state)
 
 
-def batched(program: Callable[..., Any], loop: Lanes, params: Tree, *rest: Tree) -> Tree:
+def batched(program: Callable[..., Any], loop: Loop, params: Tree, *rest: Tree) -> Tree:
     """`program(loop, params, *rest)`; under `vmap` the same program with one more batch axis, which all of `rest` gains."""
 
     @custom_vmap
@@ -128,10 +136,11 @@ def batched(program: Callable[..., Any], loop: Lanes, params: Tree, *rest: Tree)
     return run(params, rest)
 
 
-def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[Any], args: Tree) -> Tree:
-    """`program` with one more batch in the last axis, chunk by chunk; in the result the batch axis is the first.
+def _trailing(program: Callable[..., Any], loop: Loop, size: int, mapped: list[Any], args: Tree) -> Tree:
+    """`program` with one more batch of `size` maps in the last axis, chunk by chunk; in the result it is the first axis.
 
-    A chunk takes as many steps as its longest map, so maps are sorted by their work.
+    `mapped` says which leaves of `args`, the params and the rest, have the batch axis. A chunk takes as many steps as its
+    longest map, so maps are sorted by their work.
     """
     leaves, tree = jax.tree.flatten(args)
     yes = jax.tree.leaves(mapped)
@@ -139,17 +148,17 @@ def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[
     chunks = -(-size // chunk)
     chunk = -(-size // chunks)
 
-    def some(part: list[Any]) -> Tree:
+    def one_chunk(part: list[Any]) -> Tree:
         own = iter(part)
 
-        def last(x: jax.Array, batched: bool) -> jax.Array:
+        def batch_last(x: jax.Array, batched: bool) -> jax.Array:
             if batched:
                 x = jnp.moveaxis(next(own), 0, -1)
             else:
                 x = jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), chunk))
             return x.reshape(*x.shape[:-2], loop.width * chunk) if loop.width else x
 
-        params, rest = jax.tree.unflatten(tree, [last(x, y) for x, y in zip(leaves, yes, strict=True)])
+        params, rest = jax.tree.unflatten(tree, [batch_last(x, y) for x, y in zip(leaves, yes, strict=True)])
         with jax.numpy_rank_promotion("allow"):  # what belongs to one map, [B], meets maps [m, m, B]: that is the layout
             out = batched(program, replace(loop, width=max(loop.width, 1) * chunk), params, *rest)
         if loop.width:
@@ -158,7 +167,7 @@ def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[
 
     batch = [x for x, y in zip(leaves, yes, strict=True) if y]
     if chunks == 1:
-        return some(batch)
+        return one_chunk(batch)
     extra = chunks * chunk - size
     order = place = jnp.arange(size)
     if loop.done is not None:
@@ -167,11 +176,11 @@ def _trailing(program: Callable[..., Any], loop: Lanes, size: int, mapped: list[
         order = jnp.argsort(jnp.max(work.reshape(size, -1), axis=1))
         place = jnp.argsort(order)
     order = jnp.concatenate([order, jnp.broadcast_to(order[-1:], (extra,))])
-    out = lax.map(some, [x[order].reshape(chunks, chunk, *x.shape[1:]) for x in batch])
+    out = lax.map(one_chunk, [x[order].reshape(chunks, chunk, *x.shape[1:]) for x in batch])
     return jax.tree.map(lambda x: x.reshape(chunks * chunk, *x.shape[2:])[place], out)
 
 
-def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
+def run(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree]:
     """Runs the loop: the last state, and the number of steps."""
 
     def advance(carry: Tree) -> Tree:
@@ -188,10 +197,12 @@ def run(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree]:
     return state, loop.taken(count)
 
 
-def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
-    """Runs the loop for reverse mode: the last state, the number of steps, the tape, and some earlier states.
+def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
+    """Runs the loop for reverse mode: the last state, the number of steps, the tape, and the memory of earlier states.
 
-    The tape holds the records of the last `loop.room` steps. States are kept only where there may be more steps than that.
+    The tape holds the record of step k in place k % room, for the last `loop.room` steps. The memory is empty where there
+    cannot be more steps than that. Else it is a pair: the steps before which states were kept, -1 for a free slot, and these
+    states.
     """
 
     def advance(carry: Tree) -> Tree:
@@ -226,32 +237,34 @@ def record(loop: Lanes, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tr
     (state, _, count, _, tape), _, (places, saved) = lax.while_loop(
         lambda c: ~jnp.all(c[0][3]), stretch, (carry, jnp.int32(loop.room), memory)
     )
-    places = jnp.broadcast_to(places, (*jax.tree.leaves(state)[0].shape[: loop.lanes], slots))
-    places = loop.said(places)
+    places = jnp.broadcast_to(places, (*jax.tree.leaves(state)[0].shape[: loop.batch_axes], slots))
+    places = loop.for_each_map(places)
     return state, loop.taken(count), tape, (places, saved)
 
 
-def push(loop: Lanes, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
+def push(loop: Loop, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
     """The jvp of the loop: the tangent of the last state. Computes the steps again."""
 
-    def push(k: jax.Array, carry: Tree) -> Tree:
+    def one(k: jax.Array, carry: Tree) -> Tree:
         x, dx = carry
         new, record = loop.step.recorded(params, k, x)
         dnew = loop.step.push(params, k, record, dparams, dx)
         return loop.keep(loop.beyond(k, count), carry, (new, dnew))
 
-    return lax.fori_loop(0, loop.total(count), push, (state, dstate))[1]
+    return lax.fori_loop(0, loop.total(count), one, (state, dstate))[1]
 
 
-def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+def pull(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
     """The vjp of the loop: the cotangents of params and of the first state, computed from the last step backwards.
 
-    Records that are no longer on the tape are computed anew from the last state kept before them. Where that state lies far
-    back, a state halfway is kept first, as long as there is room for one.
+    `tape` and `memory` are those of `record`. Records that are no longer on the tape are computed anew from the last state
+    kept before them. Where that state lies far back, a state halfway is kept first, as long as there is a free slot.
     """
     total = loop.total(count)
 
-    def pull(first: jax.Array, end: jax.Array, tape: Tree, carry: Tree) -> Tree:
+    def pull_back(first: jax.Array, end: jax.Array, tape: Tree, carry: Tree) -> Tree:
+        """The cotangents before step `first`, from `carry`, those before step `end`; the tape holds the steps between."""
+
         def one(j: jax.Array, carry: Tree) -> Tree:
             # The record is part of what is carried: XLA would fetch it anew for all that uses it.
             (cf, cx), record = carry
@@ -265,13 +278,14 @@ def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, memory: Tree, 
     floats = jax.eval_shape(loop.step.pull, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
     carry = (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), floats), cotangent)
     if loop.bound <= loop.room:
-        return pull(jnp.int32(0), total, tape, carry)
+        return pull_back(jnp.int32(0), total, tape, carry)
 
     def again(k: jax.Array, c: Tree) -> Tree:
         new, record = loop.step.recorded(params, k, c[0])
         return loop.keep(loop.beyond(k, count), c[0], new), loop.put(c[1], k % loop.room, record)
 
     def stretch(c: Tree) -> Tree:
+        # The steps from `end` on are pulled back; `fresh` is whether the tape still is that of the forward pass.
         end, fresh, places, saved, tape, carry = c
         before = jnp.where(places < end, places, -1)
         slot, place, free = jnp.argmax(before), jnp.max(before), jnp.argmin(places)
@@ -282,7 +296,7 @@ def pull(loop: Lanes, params: Tree, count: jax.Array, tape: Tree, memory: Tree, 
         saved = lax.fori_loop(0, halve.astype(jnp.int32), lambda _, saved: loop.put(saved, free, state), saved)
         places = places.at[free].set(jnp.where(halve, goal, places[free]))
         first = jnp.where(halve, end, jnp.maximum(end - loop.room, jnp.where(fresh, 0, place)))
-        carry = pull(first, end, tape, carry)
+        carry = pull_back(first, end, tape, carry)
         return first, jnp.zeros((), bool), jnp.where(places < first, places, -1), saved, tape, carry
 
     places, saved = memory

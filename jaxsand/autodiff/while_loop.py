@@ -16,10 +16,10 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from jaxsand.autodiff import _batched_while as lockstep
-from jaxsand.autodiff._batched_while import Done
+from jaxsand.autodiff import _batched_while
+from jaxsand.autodiff._batched_while import Done, Loop
 
-Tree: TypeAlias = lockstep.Tree
+Tree: TypeAlias = _batched_while.Tree
 
 
 class Step(Protocol):
@@ -89,7 +89,7 @@ def repeat(step: Step, count: int, params: Tree, state: Tree) -> Tree:
 
     Differentiable like `repeat_until`.
     """
-    return _loop(lockstep.Lanes(None, step, count, 0), params, state)[0]
+    return _loop(Loop(None, step, count, 0), params, state)[0]
 
 
 def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) -> tuple[Tree, jax.Array]:
@@ -97,8 +97,8 @@ def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) 
 
     Differentiable once, in forward and reverse mode, with respect to the floats of `params` and `state`; the number of steps
     is held fixed. Forward mode computes the steps a second time. Reverse mode keeps the records of the last `step.tape`
-    steps and up to `lockstep.KEPT` states, whatever the bound. From these states it computes the earlier records of a longer
-    loop, at the cost of about one forward pass, and half of one for each doubling beyond `KEPT` tapes.
+    steps and up to ten states, whatever the bound. From these states it computes the earlier records of a longer loop,
+    at the cost of about one forward pass, and half of one more for each doubling of the steps beyond 8 `step.tape`.
 
     Args:
         done: whether to stop before step k; a function of params, k and the state that closes over no traced value.
@@ -125,20 +125,20 @@ def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) 
         >>> jax.grad(lambda x: repeat_until(small, halve, 100, jnp.float32(0.5), x)[0])(6.0).item()
         0.125
     """
-    return _loop(lockstep.Lanes(done, step, bound, 0), params, state)
+    return _loop(Loop(done, step, bound, 0), params, state)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _loop(loop: lockstep.Lanes, params: Tree, state: Tree) -> tuple[Tree, jax.Array]:
-    return lockstep.batched(lockstep.run, loop, params, state)
+def _loop(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, jax.Array]:
+    return _batched_while.batched(_batched_while.run, loop, params, state)
 
 
 @_loop.defjvp
-def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
+def _loop_jvp(loop: Loop, primals: Tree, tangents: Tree) -> Tree:
     params, state = first_order(primals)
     dparams, dstate = tangents
     dparams = tuple(d for d in jax.tree.leaves(dparams) if d.dtype != jax.dtypes.float0)
-    end, count, tape, saved = lockstep.batched(lockstep.record, loop, params, state)
+    end, count, tape, saved = _batched_while.batched(_batched_while.record, loop, params, state)
     none = None if count is None else np.zeros(count.shape, jax.dtypes.float0)
     if not jax.tree.leaves((dparams, dstate)):
         return (end, count), (dstate, none)
@@ -149,12 +149,12 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
     def forward(_: object, vector: jax.Array) -> jax.Array:
         df, dx = unravel(vector)
         params, state, *_ = shown(kept)
-        return ravel_pytree((df, lockstep.batched(lockstep.push, loop, params, state, count, df, dx)))[0]
+        return ravel_pytree((df, _batched_while.batched(_batched_while.push, loop, params, state, count, df, dx)))[0]
 
     def backward(_: object, vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
         params, _, tape, saved = shown(kept)
-        df, dx = lockstep.batched(lockstep.pull, loop, params, count, tape, saved, cx)
+        df, dx = _batched_while.batched(_batched_while.pull, loop, params, count, tape, saved, cx)
         return ravel_pytree((jax.tree.map(jnp.add, cf, df), dx))[0]
 
     # The solution of "identity times x = start" by rules of our own: how JAX is told a linear map and its transpose.
@@ -165,8 +165,8 @@ def _loop_jvp(loop: lockstep.Lanes, primals: Tree, tangents: Tree) -> Tree:
 def hidden(tree: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:
     """The bits of a tree's floats as integers, and a function that turns them back into floats.
 
-    Saved values leave the compiled program that computes them, where `jax_debug_nans` would report the NaN that marks cells
-    without sand (ghost_cells.py). The conversion costs nothing.
+    What reverse mode saves leaves the compiled program that computes it. There `jax_debug_nans` would report the NaN that
+    marks cells without sand (ghost_cells.py). The conversion costs nothing.
     """
     types = jax.tree.map(jnp.result_type, tree)
 
