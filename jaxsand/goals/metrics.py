@@ -1,7 +1,7 @@
 """Measures of how near a map is to its goal, and goals as height maps.
 
 Lengths are in metres. A cell counts as dug when it is lower than half the trench depth. A goal drawn as a binary map holds
-no berms, so it is compared on min(h, 0), on what is dug, as arXiv:1908.02745 does; the figure with berms is given beside it.
+no berms, so it is compared on min(h, 0), on what is dug, as arXiv:1908.02745 does; results give the measure with berms too.
 """
 
 import math
@@ -92,7 +92,7 @@ def l2_reduction(goal: _Map, before: _Map, after: _Map) -> jax.Array:
       after: [..., H, W] (m).
 
     Returns:
-      [...]: 1 at the goal, 0 where nothing was gained, below 0 where it got worse.
+      [...]: 1 at the goal, 0 where nothing was gained, below 0 where it got worse, -inf where `before` was the goal.
 
     Source: arXiv:1908.02745.
 
@@ -213,7 +213,7 @@ def place(strokes: np.ndarray, square: tuple[float, float] = GLYPH_SQUARE) -> np
 
 
 def resample(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """A map at another resolution over the same field.
+    """A map of the same area at another resolution.
 
     Where cells grow larger, each new cell has the mean over its area; where they grow smaller, heights are interpolated
     linearly. Rows and columns are scaled independently.
@@ -241,7 +241,7 @@ def resample(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _resample_rows(image: np.ndarray, rows: int) -> np.ndarray:
-    """A map with another number of rows, by means or by linear interpolation."""
+    """A map [H, ...] with another number of rows, by means or by linear interpolation."""
     old = image.shape[0]
     if rows == old:
         return image
