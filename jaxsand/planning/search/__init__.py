@@ -31,7 +31,7 @@ class SandPlan:
       lower_bound: proven: no plan of as many strokes as were allowed, however placed, comes closer than this (m).
       estimate: a guess (m) of what could be reached: what is left if every stroke gains as much as the best of all that were
         tried.
-      effort: how many pushes were simulated, in full and roughly.
+      effort: how many pushes were simulated in full, and how many roughly (see `plan_sand`).
       reason: why there are no paths, and what to do; None where there are some.
       strokes: every stroke or leg [n, 4] = x0, y0, x1, y1 (m), in order.
       gap: after - lower_bound (m).
@@ -83,10 +83,10 @@ def plan_sand(
 ) -> SandPlan:
     """Searches for strokes that bring a map close to a goal, by trying them on simulated sand.
 
-    The search is best-first in layers: the nodes of layer k are maps after k strokes (with `Steps`, and the tool's place).
-    Hundreds of children are simulated at once, and nodes whose maps look alike are merged. The runs of the binary plan
-    (`plan`, on blocks as wide as the blade) are among the children. With a `Lattice`, the best plans' strokes are then
-    varied one at a time.
+    It is a beam search. The nodes of layer k are maps after k strokes (with `Steps`, maps with the tool in a place after k
+    legs), and the closest go on; of nodes whose maps look alike only the closest does. With a `Lattice`, the straight runs
+    of the binary plan (`plan`, on blocks as wide as the blade) are among the children, and the best plans' strokes are then
+    varied one at a time. With `Steps`, the binary plan's walk over one piece of what is to dig is among the paths.
 
     Args:
       scene: grid, sand and a `Blade`.
@@ -95,7 +95,7 @@ def plan_sand(
       strokes: the largest number of strokes, or of legs.
       actions: `Lattice()` for strokes with the tool lifted in between (the default), `Steps()` for one path with the tool
         down.
-      budget: how many full pushes the search may cost at most; a rough push counts as 1/12. With too few for what it does
+      budget: how many full pushes the search may cost at most; a rough push (`SwathPush()`, 8 sweeps) counts as 1/12. With too few for what it does
         at each stroke, it tries fewer strokes, or none.
       seed: equal seeds give equal plans.
 
@@ -128,7 +128,7 @@ def plan_sand(
     paths, effort = _search(job, budget, np.random.default_rng(seed)) if before > 0 else ([], Effort())
     after = replay(scene, height, paths)
     left = float(distance(after, goal))
-    if left > before:  # what the search saw is not what `follow` does
+    if left > before:  # `follow` leaves slightly other maps than the search's own pushes
         paths, after, left = [], height, before
     bound = least_distance(scene, height, goal, strokes, longest_stroke(scene, actions))
     estimate = max(0.0, before - strokes * effort.gain)
@@ -144,6 +144,7 @@ def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Pat
 
 
 def _checked(scene: Scene, height: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The height (float32) and the goal (float64); raises ValueError unless they fit the scene and the height is at rest."""
     blade_size(scene)
     height = np.asarray(fit(scene, as_array("height", height, np.float32))[1])
     goal = np.asarray(gaps(goal), float)
