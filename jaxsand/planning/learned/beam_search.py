@@ -1,4 +1,4 @@
-"""Look-ahead with the simulator as a model: a policy's proposals are pushed, the best plans go on, and the closest is
+"""Look-ahead with the simulator as a model: a policy's proposals are pushed, the best plans go on, and the closest of all is
 refined.
 """
 
@@ -11,13 +11,14 @@ from jaxsand.planning.stroke_loss import SandLoss, pushed
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene
 
-_ASIDE = (0.25, 0.1)  # cells: so far the numbers of a plan are moved, to see what that does
+_ASIDE = (0.25, 0.1)  # cells: how far `put_right` moves each number of a plan, in its first and in its second round
 
 
 class Proposes(Protocol):
     """A policy that proposes strokes, such as `policy.Policy`."""
 
-    def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]: ...
+    def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """For maps [B, H, W] (m), strokes [B, count, 4] (m), likeliest first, and the logarithms of their likelihoods."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +39,17 @@ class Ahead:
 def one_after_the_other(
     policy: Proposes, scene: Scene, start: np.ndarray, goal: np.ndarray, strokes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lets the policy act alone on many goals at once: it pushes its likeliest stroke `strokes` times, whatever comes of it.
+    """Lets the policy act alone on many goals at once: its likeliest stroke is pushed, `strokes` times.
 
     Args:
       policy: proposes strokes.
       scene: grid, sand and blade.
       start, goal: maps [B, H, W] (m).
-      strokes: how many.
+      strokes: how many each plan has.
 
     Returns:
-      The plans [B, strokes, 4] (m), and the maps [strokes + 1, B, H, W] (m) before them and after each stroke, NaN from
-      where an outcome is not clean.
+      The plans [B, strokes, 4] (m), and the maps [strokes + 1, B, H, W] (m) before them and after each stroke. A map is NaN
+      from the stroke on whose outcome is not clean.
     """
     maps, plans = [start.astype(np.float32)], []
     for _ in range(strokes):
@@ -98,14 +99,14 @@ def most_calls(strokes: int, width: int) -> int:
 def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray, int]:
     """Refines a plan: moves its end points a little, to a plan that ends at least as close to the goal.
 
-    A network sees where a stroke belongs to a tenth of a cell; the simulator tells more. Each of the plan's 4 N numbers is
-    moved by s up and down, s = 1/4 cell and then 1/10. From the losses f that these moves leave, all numbers are moved at
-    once to the least of the parabolas through them, and half as far:
+    A network sees where a stroke belongs to a tenth of a cell; the simulator tells more. There are two rounds, with s = 1/4
+    and 1/10 of a cell. Each of the plan's 4 N numbers alone is moved by s up and down, which gives the losses f(s) and
+    f(-s). Then all numbers are moved at once to the minima of the parabolas through these losses,
 
-        s (f(-s) - f(s)) / (2 (f(s) - 2 f(0) + f(-s)))   in each number, at most s.
+        s (f(-s) - f(s)) / (2 (f(s) - 2 f(0) + f(-s)))   in each number, at most s,
 
-    The closest plan of all that were tried is taken. Strokes stay on the map: near its edge the moves are shorter, and the
-    parabolas only approximate.
+    and, as another plan, half as far. Each round takes the closest of all these plans. Strokes stay on the map: near its
+    edge the moves are shorter, and the parabolas only approximate.
 
     Args:
       sand: the loss, its start and its goal.
@@ -133,9 +134,9 @@ def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray
 
 
 def _downhill(here: float, up: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """The places, -1 to 1, of the least of parabolas through the losses at -1, 0 and 1.
+    """The places, -1 to 1, of the minima of parabolas through the losses `down` at -1, `here` at 0 and `up` at 1.
 
-    Where a parabola has no least, the lower side is taken, or 0 if neither is lower.
+    Where a parabola has no minimum, the lower side is taken, or 0 if neither is lower.
     """
     bend = up - 2 * here + down
     curved = np.isfinite(bend) & (bend > 0)
@@ -155,7 +156,10 @@ def _losses(sand: SandLoss, plan: np.ndarray) -> np.ndarray:
 
 
 def _different(far: np.ndarray, maps: np.ndarray, most: int) -> list[int]:
-    """Indices of the closest maps, each farther from those before it than a third of its own distance from the goal."""
+    """Indices of up to `most` maps, closest to the goal first, without infinite losses `far`.
+
+    Each is farther from those before it than a third of its own distance from the goal.
+    """
     kept: list[int] = []
     for i in np.argsort(far, kind="stable"):
         if not np.isfinite(far[i]):
