@@ -26,7 +26,7 @@ class NoStop:
       NoStop()
     """
 
-    size = 4
+    size = 4  # numbers of an action
 
     def over(self, action: jax.Array, before: jax.Array, after: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The map after an action, and whether that ended the episode."""
@@ -46,7 +46,7 @@ class Stop:
       (5,)
     """
 
-    size = 5
+    size = 5  # numbers of an action
 
     def over(self, action: jax.Array, before: jax.Array, after: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The map after an action, and whether that ended the episode."""
@@ -191,9 +191,9 @@ class MultiStroke:
     An action holds x0, y0, x1, y1, each from -1 to 1, from the first to the last cell centre of the map; numbers beyond that
     push from off the map. Observations are the maps "goal" and "current" [H, W] in units of the blade's depth (float32).
 
-    With L = sqrt(sum (goal - h)^2), in units of the blade's depth, the reward is L_t - L_{t+1}. An episode is truncated
-    after `limit` strokes, and terminated when a `Stop` asks for it. `info` holds the simulator's "outcome"; a push that
-    leaves a map that is not finite changes nothing.
+    With L = sqrt(sum (goal - h)^2), of the maps as `measure` sees them and in units of the blade's depth, the reward is
+    L_t - L_{t+1}. An episode is truncated after `limit` strokes, and terminated when a `Stop` asks for it. `info` holds the
+    simulator's "outcome"; a push that leaves a map that is not finite counts as a stroke and leaves the map as it was.
 
     The reward is differentiable once, in forward and reverse mode, in the action, the state's maps and the scene's floats
     (but not where the map equals the goal, nor in the fifth number of a `Stop`), whatever the batching.
@@ -251,15 +251,15 @@ class MultiStroke:
         truncated = (new.time >= params.limit) & ~terminated
         return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome}
 
-    step = episode.step
+    step = episode.step  # `step_env`, and the next episode begins where that ended one
 
     def distance(self, state: StrokeState, params: StrokeParams) -> jax.Array:
-        """L: the l2 distance of goal and map in units of the blade's depth (float32)."""
+        """L, a scalar: the l2 distance of goal and map as measured, in units of the blade's depth (float32)."""
         far = metrics.l2(self.measure.seen(state.goal), self.measure.seen(state.height))
         return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def stroke(self, action: jax.Array, params: StrokeParams) -> jax.Array:
-        """The stroke x0, y0, x1, y1 (m) of an action."""
+        """The stroke x0, y0, x1, y1 (m), [4], of an action."""
         cells, spacing = _cells(params).astype(action.dtype), jnp.asarray(params.scene.grid.spacing, action.dtype)
         return (0.5 + (action[:4] + 1) / 2 * cells) * spacing
 
@@ -272,7 +272,7 @@ class MultiStroke:
         )
 
     def observe(self, state: StrokeState, params: StrokeParams) -> dict[str, jax.Array]:
-        """The observation of a state."""
+        """The observation of a state: its two maps, in units of the blade's depth (float32)."""
         maps = {"goal": state.goal, "current": state.height}
         return {name: (x / blade_of(params.scene).depth).astype(jnp.float32) for name, x in maps.items()}
 
@@ -287,6 +287,6 @@ class MultiStroke:
 
 
 def _cells(params: StrokeParams) -> jax.Array:
-    """The number of cells from the first to the last cell centre, for x0, y0, x1, y1."""
+    """The distance from the first to the last cell centre in spacings, for x0, y0, x1, y1: integers [4]."""
     rows, columns = params.scene.grid.shape
     return jnp.array([columns - 1, rows - 1, columns - 1, rows - 1])
