@@ -39,7 +39,7 @@ from jaxsand.terramechanics.finer import OneGrid, TwoGrids, divide, finer, isotr
 
 _REPOSE = "repose_angle"
 _TWO = TwoGrids()
-_FINER = 3  # an odd number: cells of both grids have their middles in common
+_FINER = 3  # how many times as fine; odd, so that the middle of each cell is the middle of a cell of the finer grid
 _ANGLES = (math.radians(10), math.radians(50))
 _Rules = tuple[PushRule | None, Scheme | None, Stop | None]
 _Labels = np.ndarray | jax.Array | None
@@ -48,7 +48,10 @@ _Labels = np.ndarray | jax.Array | None
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class _Group:
-    """Trials of equally many strokes: `before`, `after` and `seen` [k, H, W], and `strokes` [k, n, 4]."""
+    """Trials of equally many strokes: heights `before` and `after` [k, H, W] (m), and `strokes` [k, n, 4] (m).
+
+    `seen` [k, H, W] is true where `after` is known; elsewhere `after` is 0.
+    """
 
     before: jax.Array
     after: jax.Array
@@ -113,11 +116,10 @@ def calibrate(
 
     Returns:
       A `Calibration`: `values` and their standard `errors` by name, the `verdict`, and the scene with the values put in as
-      `model`. `values` are those of the simulator on this grid and `sand` those of the real sand. The errors hold white
-      noise in `after` and the grid's error (of its spacing and of its neighbourhood). They do not hold other errors of the
-      model, such as its rule of pushing, nor noise in `before`. Data that do not determine a parameter, or that no
-      parameters
-      explain, raise nothing: the verdict says so.
+      `model`. `values` are those of the simulator on this grid and `sand` those of the real sand. The errors include white
+      noise in `after` and the grid's error (of its spacing and of its neighbourhood). They do not include other errors of
+      the model, such as its rule of pushing, nor noise in `before`. Data that do not determine a parameter, or that no
+      parameters explain, raise nothing: the verdict says so.
 
     Raises:
       ValueError: names the argument, its value and the remedy.
@@ -181,6 +183,8 @@ def _climbs(
     noise: jax.Array,
     names: tuple[str, ...],
 ) -> Ends:
+    """Fits from every start `begin` [starts, P], in units of the ranges `box` [2, P] (their low ends, their high ends)."""
+
     def residuals(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         there = _with(scene, names, labels, box[0] + x * (box[1] - box[0]))
         return _misfits(there, rules, groups)
@@ -191,7 +195,10 @@ def _climbs(
 def _reference(
     scene: Scene, push: PushRule | None, labels: _Labels, groups: list[_Group], box: jax.Array, names: tuple[str, ...]
 ) -> Reference:
-    """Runs isotropic sand on the scene's grid and on a finer one, for `seek_limit`."""
+    """The reference model of _limit.py: isotropic sand on the scene's grid and on a finer one, pushed by the same rule.
+
+    It settles by the default scheme and stop rule. Its `x` [P] is in units of the ranges `box` [2, P].
+    """
     coarse = isotropic(scene)
     split = None if labels is None else divide(labels, _FINER)
     resolved = jax.vmap(lambda before: resolve(scene, before, _FINER))
@@ -202,22 +209,23 @@ def _reference(
 
     def reference(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         values = box[0] + jnp.asarray(x, box.dtype) * (box[1] - box[0])
-        (one, clean), (two, also) = (_refers(*some, push, values, names) for some in grids)
-        fine = np.asarray(two, float)
-        return fine, (fine - np.asarray(one, float)) / (_FINER - 1), bool(clean & also)
+        (on_coarse, coarse_clean), (on_fine, fine_clean) = (_misfits_at(*some, push, values, names) for some in grids)
+        fine = np.asarray(on_fine, float)
+        return fine, (fine - np.asarray(on_coarse, float)) / (_FINER - 1), bool(coarse_clean & fine_clean)
 
     return reference
 
 
 @partial(jax.jit, static_argnames="names")
-def _refers(
+def _misfits_at(
     scene: Scene, labels: _Labels, groups: list[_Group], push: PushRule | None, values: jax.Array, names: tuple[str, ...]
 ) -> tuple[jax.Array, jax.Array]:
+    """`_misfits` for values [P] of the free parameters."""
     return _misfits(_with(scene, names, labels, values), (push, None, None), groups)
 
 
 def _misfits(scene: Scene, rules: _Rules, groups: list[_Group]) -> tuple[jax.Array, jax.Array]:
-    """The differences between simulated and seen heights, 0 in unseen cells, and whether all outcomes are clean.
+    """Simulated less seen heights (m) of all cells of all trials, 0 in unseen cells, and whether all outcomes are clean.
 
     A scene on a finer grid than the data's is averaged over the data's cells first.
     """
@@ -230,7 +238,7 @@ def _misfits(scene: Scene, rules: _Rules, groups: list[_Group]) -> tuple[jax.Arr
 
 
 def _run(scene: Scene, rules: _Rules, before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The maps [k, H, W] after the pushes, and the outcomes [k]."""
+    """The maps [k, H, W] (m) after the pushes, and outcomes [k] that are 0 where every push was clean."""
     push, scheme, stop = rules
 
     def one(before: jax.Array, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -287,6 +295,7 @@ def _grouped(scene: Scene, trials: list[Trial]) -> tuple[list[_Group], int]:
 
 
 def _labels(scene: Scene, regions: ArrayLike | jax.Array | None) -> np.ndarray | None:
+    """The labels as int32; raises ValueError unless they fit the scene and leave no number out."""
     if regions is None:
         return None
     labels = np.asarray(unmasked("regions", regions, "give every cell a region, such as regions.filled(0)"))
@@ -299,7 +308,7 @@ def _labels(scene: Scene, regions: ArrayLike | jax.Array | None) -> np.ndarray |
 
 
 def _ranges(scene: Scene, free: Free, regions: int) -> tuple[list[Range], tuple[str, ...]]:
-    """A range for every parameter, and the names that are free, the angle of repose first."""
+    """A range for every parameter, and the names that are free, the angle of repose first; with regions it has several."""
     asked = as_ranges(free)
     values = {field.name: concrete(getattr(scene.tool, field.name)) for field in fields(scene.tool)}
     tool = {name: float(value) for name, value in values.items() if value is not None and np.isfinite(value).all()}
@@ -324,6 +333,7 @@ def _ranges(scene: Scene, free: Free, regions: int) -> tuple[list[Range], tuple[
 
 
 def _range_of_tool(scene: Scene, name: str, guess: float, ends: tuple[float, float] | None) -> Range:
+    """The range of a field of the tool: `ends`, or a third to three times the guess as far as the field allows."""
     least = float(scene.grid.spacing) if name in ("width", "thickness", "radius") else -math.inf
     most = {"slip_angle": math.pi / 2, "sinkage": float(getattr(scene.tool, "radius", math.inf))}.get(name, math.inf)
     if ends is None:
