@@ -5,7 +5,7 @@ each is differentiated by JAX but for the sand's coming to rest, whose derivativ
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -32,10 +32,12 @@ State = tuple[jax.Array, Fluxes, Stand]  # heights, fluxes, and how sand stood l
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Ready:
-    """Sand that is yet to come to rest: how it stands near the blade and in the block, at which rate it flows, its heights,
-    a guess of what flows, and which share of a whole sub-step this one is."""
+    """Sand that is yet to come to rest: how it stands near the blade and in the block, the blade's bottom (quanta; a number
+    or a map near the blade), at which rate sand flows, its heights, a guess of what flows, and which share of a whole
+    sub-step this one is."""
 
     near: Stand
+    bottom: jax.Array
     sand: Sand
     rate: jax.Array
     height: jax.Array
@@ -137,7 +139,8 @@ class Advance(Step):
         ahead = jnp.where(k >= int(self.lowered), jnp.minimum(way.length - begin, self.chunk * self.substep), 0)
         beside = blade.share(across, -way.side, way.side)
         cover = inner(blade.straight(along - begin, beside, way.half, ahead).swept)
-        return cover, way.rate * self.block.contact(way, view, cover, h)
+        lowest = way if way.rise is None else way.at(jnp.where(way.rise < 0, begin + ahead, begin))
+        return cover, way.rate * self.block.contact(lowest, view, cover, h)
 
     def ready(
         self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: State
@@ -156,14 +159,30 @@ class Advance(Step):
         half, further = spread(way.half, along), spread(ahead, along)
         reach = blade.straight(along - spread(begin, along), beside, half, further)
         near = self.block.part(h)
-        taken = jnp.where(ahead > 0, blade.cleared(reach, near, spread(way.bottom / way.quantum, near)), 0)
+        if way.rise is None:
+            taken = blade.cleared(reach, near, spread(way.bottom / way.quantum, near))
+        else:
+            old, new = (self.floor(way, reach, by) for by in (begin, begin + ahead))
+            taken = blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near))
+            way = replace(way, bottom=new * spread(way.quantum, near))
+        taken = jnp.where(ahead > 0, taken, 0)
         room = self.block.part(view.holds if view.beyond is None else view.holds + view.beyond)
         shares = blade.onward(spread(pose.cos, near), spread(pose.sin, near), room)
         h, lost = self.block.displaced(way, view, shares, h, taken)
         around = self.block.around(view, reach)
         sand = self.block.sand(way, view, clear, around)
         guess = self.block.guess(around.gates, jnp.where(moving, part, 0), flux)
-        return Ready(around, sand, rate * part, h, guess, part), lost
+        return Ready(around, way.bottom / way.quantum, sand, rate * part, h, guess, part), lost
+
+    def floor(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
+        """The blade's bottom over each cell near it (quanta), when it has moved by a length (spacings).
+
+        Under a bottom that rises, each cell's floor is where the blade's front left it.
+        """
+        assert way.rise is not None
+        behind = blade.behind_the_front(reach, spread(way.half, inner(reach.along)))
+        past = jnp.where(way.rise > 0, jnp.minimum(behind, by), 0)
+        return (way.bottom + (by - past) * way.rise) / way.quantum
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
         if isinstance(record, Moving):
@@ -265,5 +284,5 @@ class _Inside:
         """What the sand's coming to rest depends on, the fluxes that are kept beside its own, and the sand."""
         ready = self.ready(i, floats, rate, h, flux)
         near, sand = ready.near, ready.sand
-        rested = Rested(near.gates, near.stretch, sand.bottom, sand.drop, ready.rate, ready.height, ready.guess)
+        rested = Rested(near.gates, near.stretch, ready.bottom, sand.drop, ready.rate, ready.height, ready.guess)
         return (rested, tuple((1 - ready.part) * f for f in flux) if self.advance.keeps else ()), sand

@@ -25,6 +25,7 @@ from jaxsand.scene.grid import Neighbours
 
 _LEAST = 1e-4
 SLIVER = 0.02  # the smallest open share that is divided by: in a narrower one sand stands as high as in this
+_SINKS = 0.02  # the slope from which on a blade counts as sinking in full
 _LEAVES = 0.125  # spacings that the blade moves until sand inside it has left
 Shares = dict[tuple[int, int], jax.Array]
 
@@ -90,18 +91,36 @@ def facing(across: jax.Array, angle: jax.Array) -> jax.Array:
     return jnp.where(across * angle > 0, -1.0, 1.0).astype(across.dtype)
 
 
-def cleared(reach: Reach, h: jax.Array, bottom: jax.Array) -> jax.Array:
+def cleared(reach: Reach, h: jax.Array, bottom: jax.Array, behind: jax.Array | None = None) -> jax.Array:
     """The sand that has to leave the cells of a block, in whole quanta.
 
     Ahead of the middle plane, sand that is still inside the blade leaves as well, from cells that the blade almost fills. It
-    leaves over a fixed distance: sand flows back into such cells, and emptying them in each sub-step would pump.
+    leaves over a fixed distance: sand flows back into such cells, and emptying them in each sub-step would pump. Behind the
+    plane the share `behind` of that leaves, if any.
     """
     before, swept, along = inner(reach.before), inner(reach.swept), inner(reach.along)
     grown = swept > before
     part = jnp.where(grown, (swept - before) / jnp.where(grown, 1 - before, 1), 0)
-    inside = jnp.where(along > 0, jnp.clip(1 - (1 - swept) / SLIVER, 0, 1), 0)
+    inside = jnp.clip(1 - (1 - swept) / SLIVER, 0, 1)
+    inside = jnp.where(along > 0, inside, 0 if behind is None else behind * inside)
     inside = inside * jnp.minimum(inner(reach.gone) / _LEAVES, 1)
     return truncate(jnp.maximum(part, inside) * jnp.maximum(h - bottom, 0))
+
+
+def behind_the_front(reach: Reach, half: jax.Array) -> jax.Array:
+    """How far the middle of what the blade covers of each cell lies behind its front, afterwards (spacings)."""
+    along = inner(reach.along)
+    return half - (jnp.clip(along - 0.5, -half, half) + jnp.clip(along + 0.5, -half, half)) / 2
+
+
+def cleared_beneath(reach: Reach, h: jax.Array, old: jax.Array, new: jax.Array, rise: jax.Array) -> jax.Array:
+    """`cleared` for a blade whose bottom over each cell rises or sinks from `old` to `new`, at the slope `rise` of its way.
+
+    A bottom that sinks covers sand below itself, which leaves as well. It may be several cells from the front, so sand in
+    cells that the blade almost fills leaves behind the middle plane too.
+    """
+    beneath = truncate(inner(reach.before) * jnp.maximum(jnp.minimum(h, old) - new, 0))
+    return beneath + cleared(reach, h - beneath, new, jnp.clip(-rise / _SINKS, 0, 1))
 
 
 def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.Array, Fluxes]:

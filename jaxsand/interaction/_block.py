@@ -1,6 +1,6 @@
 """The block of the map around a tool: how it is read and written back, and how the sand in it stands."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -30,7 +30,8 @@ class Way:
         length: length of the leg.
         half: half of the blade's thickness.
         side: half of the blade's width.
-        bottom: height of the blade's bottom.
+        bottom: height of the blade's bottom at the start; a map of the inner part if cells differ.
+        rise: what the bottom rises by in each spacing of the leg (m), or None if it stays at one height.
         spacing: the grid's spacing (m).
         quantum: quantum of heights.
         drop: largest stable step, a scalar or a flat map [cells].
@@ -50,6 +51,11 @@ class Way:
     level: jax.Array | None
     rate: jax.Array
     angle: jax.Array
+    rise: jax.Array | None
+
+    def at(self, by: jax.Array) -> "Way":
+        """The leg as it is when the blade has moved by a length (spacings): with its bottom at the height there."""
+        return self if self.rise is None else replace(self, bottom=self.bottom + by * self.rise)
 
 
 @jax.tree_util.register_dataclass
@@ -231,6 +237,8 @@ class Block:
         stand = jax.tree.map(self.put, clear, near)
         rim = None if way.level is None else way.level / way.quantum
         bottom = way.bottom / way.quantum
+        if bottom.ndim == near.open.ndim:
+            bottom = self.put(jnp.zeros_like(stand.open), bottom)
         return Sand(stand.gates, stand.open, stand.stretch, bottom, view.drop, view.sides, rim, self.neighbours)
 
     def guess(self, gates: Fluxes, part: jax.Array, flux: Fluxes) -> Fluxes:

@@ -31,7 +31,8 @@ class Job:
         bed: spacing, largest stable steps and rim.
         x, y: coordinates of the cell centres (m).
         tool: the blade or wheel.
-        bottom: height of the tool's lowest point (m).
+        bottom: height of the tool's lowest point at the start of a leg (m).
+        rise: slope at which that rises along the leg, a tangent, or None if it stays at one height.
         flow: rate and quantum of sweeps.
     """
 
@@ -40,6 +41,7 @@ class Job:
     y: Float[Array, "H 1"]
     tool: Any
     bottom: Float[Array, ""]
+    rise: Float[Array, ""] | None
     flow: Flow
 
 

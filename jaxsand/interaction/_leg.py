@@ -54,7 +54,7 @@ class Steps:
     bound: float
 
 
-Params = Callable[[Pose, jax.Array, jax.Array], Tree]  # of a pose, the length of a leg (m) and the angle before it (rad)
+Params = Callable[[Job, Pose, jax.Array, jax.Array], Tree]  # of a pose, the length of a leg (m), the angle before it (rad)
 
 
 def chunk(substep: float) -> int:
@@ -74,12 +74,12 @@ def moved(
     zero = jnp.zeros_like(length)
     nowhere = Laid(none, jnp.int32(0), jnp.int32(0))
     if before is None:
-        sand = repeat(steps.lower, 1, params(pose, zero, zero), sand)
+        sand = repeat(steps.lower, 1, params(job, pose, zero, zero), sand)
         kept = Kept(nowhere, nowhere, zero, zero)
     else:
         assert isinstance(kept, Kept)
         sand, kept = _turned(job, steps, params, shape, pose, before, kept, sand)
-    start, onmap = over_the_map(scene, job, pose, length)
+    there, start, onmap = over_the_map(scene, job, pose, length)
     stride = chunk(substep) * substep
     bound = math.ceil(steps.bound / stride) + 1
     frame = frame_of(shape, _in_spacings(start, dx))
@@ -91,7 +91,9 @@ def moved(
     if before is not None:
         alike = jnp.clip(before.cos * pose.cos + before.sin * pose.sin, 0, 1)
         flux = _times(alike, seen(block, frame, first(jnp.int32(0)), kept.ahead))
-    sand, count = repeat_until(steps.ahead.done, steps.ahead, bound, params(start, onmap, zero), replace(sand, flux=flux))
+    sand, count = repeat_until(
+        steps.ahead.done, steps.ahead, bound, params(there, start, onmap, zero), replace(sand, flux=flux)
+    )
     if steps.ahead.keeps:
         last = count - 1 - int(before is None)
         kept = replace(kept, ahead=lay(block, frame, first(last), sand.flux), since=kept.since + length / dx)
@@ -110,7 +112,7 @@ def _turned(
     sense = jnp.sign(angle)
     alike = jnp.where(sense * kept.sense < 0, 0, jnp.clip(1 - kept.since * dx / reach(job.tool), 0, 1))
     flux = _times(alike, seen(block, frame, first, kept.turned))
-    turn = params(before, jnp.zeros_like(angle), angle)
+    turn = params(job, before, jnp.zeros_like(angle), angle)
     bound = math.ceil(math.pi * math.hypot(*shape) / steps.turn.substep) + 1
     sand, _ = repeat_until(steps.turn.done, steps.turn, bound, turn, replace(sand, flux=flux))
     turns = sense != 0
@@ -137,6 +139,7 @@ def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.
         None if rim is None else rim.level,
         job.flow.rate,
         angle,
+        None if job.rise is None else job.rise * dx,
     )
 
 

@@ -1,7 +1,7 @@
 """Moves a tool along a path of straight legs, with any rule for what it does to the sand on each."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -72,18 +72,28 @@ def along_legs(
     rate: jax.Array | float,
     leg: Leg,
     record: Record | None = None,
+    *,
+    rises: bool = False,
 ) -> tuple[Pushed, Tree]:
-    """Lowers the tool at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it.
+    """Lowers the tool at path[0], moves it along the legs of `path` (m) and lifts it.
 
     `leg(job, pose, length, before, state)` moves the tool from `pose` by `length` (m). `before` is the tool's pose at the
     end of the last leg, or None if the tool is yet to be lowered. Without a tool the map stays as it is.
 
+    The path is [n, 2], at the tool's own depth, or [n, 3] with heights of the tool's lowest point, if `rises` says that the
+    leg heeds `job.rise`. A leg straight up or down leaves the map as it is, and the outcome says NOT_FINITE.
+
     Returns the map after the path, and what `record(height)` returned after each leg, stacked.
     """
+    if path.shape[1] == 3 and not rises:
+        raise ValueError(
+            "path: got heights, but this push keeps its tool at one depth; give SteppedPush(), or x and y alone"
+        )
     # Beyond this the floats cannot tell on which side of the map a point lies.
     farthest = scene.grid.spacing * 2.0 ** (jnp.finfo(path.dtype).nmant + 8)
-    usable = jnp.all(jnp.abs(path) < farthest) & makes_sense(scene.tool)
+    usable = jnp.all(jnp.abs(path) < farthest) & makes_sense(scene.tool) & ~jnp.any(upright(path))
     path = jnp.where(usable, path, 0)
+    path, heights = path[:, :2], path[:, 2:]
     if isinstance(scene.tool, NoTool):
         still = Pose(path[-1, 0], path[-1, 1], jnp.ones_like(path[0, 0]), jnp.zeros_like(path[0, 0]))
         legs = path.shape[0] - 1
@@ -95,28 +105,35 @@ def along_legs(
     intact, broken = mark(scene, height)
     # Of a path or a tool that is not usable nothing is used; the blade hangs above everything.
     tool = jax.tree.map(lambda leaf: jnp.where(usable, leaf, bed.spacing), scene.tool)
-    bottom = jnp.where(usable, lowest(scene.tool), jnp.inf)
-    scale = 4 * (jnp.maximum(largest(intact), bed.elsewhere) + jnp.where(usable, extent(scene.tool), 0))
+    deep = extent(scene.tool, heights)
+    scale = 4 * (jnp.maximum(largest(intact), bed.elsewhere) + jnp.where(usable, deep, 0))
     flow = Flow(jnp.asarray(rate), quantum(scale))
-    job = Job(bed, *centres(scene.grid, height.dtype), tool, bottom, flow)
+    job = Job(bed, *centres(scene.grid, height.dtype), tool, jnp.where(usable, lowest(scene.tool), jnp.inf), None, flow)
     lost = nothing_lost(bed, height)
-    moved = jnp.zeros_like(bottom)
+    moved = jnp.zeros_like(job.bottom)
     if isinstance(scene.window, Window):
         moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
     state: State = (intact, lost, moved, ())
 
+    def at_height(start: jax.Array, stop: jax.Array, length: jax.Array) -> Job:
+        if not start.size:
+            return job
+        rise = (stop[0] - start[0]) / jnp.where(length > 0, length, 1)
+        return replace(job, bottom=jnp.where(usable, start[0], jnp.inf), rise=rise)
+
     pose, length = _heading(path[0], path[1], None)
-    state = leg(job, pose, length, None, state)
+    state = leg(at_height(heights[0], heights[1], length), pose, length, None, state)
     frames = [record(unmark(state[0], height))] if record else []
 
-    def later_leg(carry: tuple[Pose, State], ends: tuple[jax.Array, jax.Array]) -> tuple[tuple[Pose, State], Tree]:
+    def later_leg(carry: tuple[Pose, State], points: tuple[jax.Array, ...]) -> tuple[tuple[Pose, State], Tree]:
         before, state = carry
-        pose, length = _heading(ends[0], ends[1], before)
+        pose, length = _heading(points[0], points[1], before)
+        job = at_height(points[2], points[3], length)
         state = leg(job, pose, length, Pose(pose.x, pose.y, before.cos, before.sin), state)
         return (pose, state), record(unmark(state[0], height)) if record else ()
 
     if path.shape[0] > 2:
-        (pose, state), rest = lax.scan(later_leg, (pose, state), (path[1:-1], path[2:]))
+        (pose, state), rest = lax.scan(later_leg, (pose, state), (path[1:-1], path[2:], heights[1:-1], heights[2:]))
         if record:
             frames = jax.tree.map(lambda first, more: jnp.concatenate([first[None], more]), frames[0], rest)
     elif record:
@@ -131,14 +148,20 @@ def along_legs(
     return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames
 
 
-def over_the_map(scene: Scene, job: Job, pose: Pose, length: jax.Array) -> tuple[Pose, jax.Array]:
-    """The part of a leg on which the tool can touch the map: the pose where that part starts, and its length (m)."""
+def upright(path: jax.Array) -> jax.Array:
+    """Which legs of a path [n, 2] or [n, 3] lead straight up or down."""
+    return jnp.all(path[1:, :2] == path[:-1, :2], axis=1) & jnp.any(path[1:, 2:] != path[:-1, 2:], axis=1)
+
+
+def over_the_map(scene: Scene, job: Job, pose: Pose, length: jax.Array) -> tuple[Job, Pose, jax.Array]:
+    """The part of a leg on which the tool can touch the map: the job and the pose where it starts, and its length (m)."""
     dx = job.bed.spacing
     along = corners(scene, job, pose)
     far = reach(job.tool) + dx
     first = jnp.clip(along[0] - far, 0, length)
     last = jnp.clip(along[1] + far, first, length)
-    return Pose(pose.x + first * pose.cos, pose.y + first * pose.sin, pose.cos, pose.sin), last - first
+    start = Pose(pose.x + first * pose.cos, pose.y + first * pose.sin, pose.cos, pose.sin)
+    return job if job.rise is None else replace(job, bottom=job.bottom + first * job.rise), start, last - first
 
 
 def turn_between(before: Pose, after: Pose) -> jax.Array:

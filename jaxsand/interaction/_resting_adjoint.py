@@ -36,7 +36,7 @@ class Tape:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Rested:
-    """The cotangents of all that the sand's coming to rest depends on; of gates and stretch near the tool."""
+    """The cotangents of all that the sand's coming to rest depends on; those of gates, stretch and bottom near the tool."""
 
     gates: Fluxes
     stretch: jax.Array
@@ -75,6 +75,10 @@ def rest_pulled(
     gain, psi = cotangent
     psi = tuple(p - d for p, d in zip(psi, steps(neighbours, gain), strict=True))
 
+    # E sums to 0 over a block, so E s may be summed with s above any one height, which keeps the terms small.
+    level = model.sand.bottom
+    one_height = level if level.ndim < gain.ndim else part(level)[0, 0]
+
     def fetched(k: jax.Array) -> Tape:
         return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, k, 0, keepdims=False), tape)
 
@@ -91,7 +95,7 @@ def rest_pulled(
         back = tuple(y - d for y, d in zip(moved, rises(neighbours, change), strict=True))
         of_surface = inner(change) / slope
         above = inner(around) - jnp.where(jnp.isfinite(sand.bottom), sand.bottom, 0)
-        work = work + of_surface * above
+        work = work + of_surface * (inner(around) - jnp.where(jnp.isfinite(one_height), one_height, 0))
         raised = jnp.where(part(lifted), part(of_surface), 0)
         of_stretch, lift = of_stretch + raised * part(above), lift + raised
         signed = [way.astype(p.dtype) * p * g for way, p, g in zip(ways, psi, sand.gates, strict=True)]
@@ -111,7 +115,7 @@ def rest_pulled(
     return Rested(
         of_gates,
         of_stretch / (1 + stretch),
-        -total(lift * stretch),
+        -(lift * stretch if model.sand.bottom.ndim == gain.ndim else total(lift * stretch)),
         of_threshold * model.rate,
         of_threshold * model.sand.drop + of_factors,
         gain,

@@ -153,34 +153,31 @@ class Roll(_Moved):
 
         def substep(i: jax.Array, state: Sanded) -> Sanded:
             h, flux, gone = state
-            poses, ahead = self._poses(track, frame, k, i)
-            before, now = (wheel.stand(block, track, f, first) for f in poses)
+            (begin, end), ahead = self._ends(track, k, i)
+            before, now = (wheel.stand(block, track.at(by), _at(frame, by), first) for by in (begin, end))
             taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, h), 0) * at(view.holds)
-            h, left = wheel.carried_back(block, track, poses[1], first, view, ahead, h, taken)
+            h, left = wheel.carried_back(block, track, _at(frame, end), first, view, ahead, h, taken)
             h = h - taken + left
             still = k < int(self.lowered)
             part = jnp.where(still, 1, ahead / self.substep)
             flux = tuple(jnp.where(still, 0, f) for f in flux)
             shares = wheel.leaving(track, frame, now)
-            h, flux, more = self.moved(track, view, shares, now, part, h, flux, left)
+            h, flux, more = self.moved(track.at(end), view, shares, now, part, h, flux, left)
             return h, flux, gone if gone is None or more is None else gone + more
 
         new, flux, gone = lax.fori_loop(0, self.chunk, substep, (old, flux, gone))
-        ends = (
-            self._poses(track, frame, k, jnp.int32(0))[0][0],
-            self._poses(track, frame, k, jnp.int32(self.chunk - 1))[0][1],
-        )
-        cover = jnp.maximum(*(wheel.stand(block, track, f, first).cover for f in ends))
+        ends = self._ends(track, k, jnp.int32(0))[0][0], self._ends(track, k, jnp.int32(self.chunk - 1))[0][1]
+        cover = jnp.maximum(*(wheel.stand(block, track, _at(frame, by), first).cover for by in ends))
         edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, new, cover))
         return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
 
-    def _poses(self, track: Track, frame: Frame, k: jax.Array, i: jax.Array) -> tuple[tuple[Frame, Frame], jax.Array]:
-        """The frames of the wheel before and after sub-step i of step k, and the distance between them (spacings)."""
+    def _ends(self, track: Track, k: jax.Array, i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        """How far ahead the wheel is before and after sub-step i of step k, and the distance between them (spacings)."""
         length, moving = track.way.length, k >= int(self.lowered)
         steps = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(length.dtype)
         begin = jnp.minimum(steps * self.substep, length)
         ahead = jnp.where(moving, jnp.minimum(length - begin, self.substep), 0)
-        return (_at(frame, begin), _at(frame, begin + ahead)), ahead
+        return (begin, begin + ahead), ahead
 
 
 def _at(frame: Frame, by: jax.Array) -> Frame:

@@ -52,6 +52,10 @@ class Track:
     slip: jax.Array
     carried: jax.Array | None
 
+    def at(self, by: jax.Array) -> "Track":
+        """The leg as it is when the wheel has moved by a length (spacings)."""
+        return self if self.way.rise is None else replace(self, way=self.way.at(by))
+
     def seen(self, frame: Frame) -> jax.Array:
         """The slip angle in a frame, where a mirror changes its sign."""
         return jnp.where(frame.flip_x ^ frame.flip_y ^ frame.swap, -self.slip, self.slip)

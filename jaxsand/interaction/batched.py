@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.rule import PushRule
-from jaxsand.interaction.simulate import Rules, Shaped, lifted, ready, step, windows_for
+from jaxsand.interaction.simulate import STROKES, Rules, Shaped, lifted, ready, step, windows_for
 from jaxsand.relaxation.batching import in_groups, in_turns, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
@@ -162,8 +162,9 @@ def _batch(
 ) -> Tree:
     height = as_batch(height)
     stroke = as_array("stroke", stroke, height.dtype, POINTS)
-    if stroke.shape != (height.shape[0], 4):
-        raise ValueError(f"stroke: got shape {list(stroke.shape)}; give [{height.shape[0]}, 4], one stroke for each map")
+    if stroke.ndim != 2 or stroke.shape[0] != height.shape[0] or stroke.shape[1] not in STROKES:
+        remedy = f"give [{height.shape[0]}, 4], one stroke for each map, or [{height.shape[0]}, 6] with heights"
+        raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
     check_chunk(chunk)
     scene, _, rules = ready(scene, height[0], *rules)
 
@@ -176,8 +177,8 @@ def _batch(
 
 
 def _lengths(batch: Batch) -> np.ndarray:
-    stroke = np.asarray(batch[1])
-    return np.hypot(*(stroke[:, 2:] - stroke[:, :2]).T)
+    start, stop = np.split(np.asarray(batch[1]), 2, axis=1)
+    return np.hypot(*(stop - start)[:, :2].T)
 
 
 def _flagged(out: Tree) -> jax.Array:
@@ -205,7 +206,7 @@ def _act_program() -> Callable[[Scene, Rules, Batch], Pushed]:
 
 
 def _acted(scene: Scene, push: PushRule, batch: Batch) -> Pushed:
-    return jax.vmap(lambda h, s: push.along(scene, h, s.reshape(2, 2))[0])(*batch[:2])
+    return jax.vmap(lambda h, s: push.along(scene, h, s.reshape(2, -1))[0])(*batch[:2])
 
 
 @cache

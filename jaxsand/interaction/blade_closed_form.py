@@ -134,7 +134,7 @@ def _sweep_out(  # noqa: PLR0915
     dx, tool = job.bed.spacing, job.tool
     half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2
     first_pose, under = pose, coverage(tool, pose, job.x, job.y, dx)
-    pose, length = over_the_map(scene, job, pose, length)
+    _, pose, length = over_the_map(scene, job, pose, length)
     cover = coverage(tool, pose, job.x, job.y, dx, length)
     sand = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
     h, taken = take(job, h, old, jnp.maximum(cover, old))

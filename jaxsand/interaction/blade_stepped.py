@@ -58,7 +58,7 @@ def push_along(
     """
 
     leg = partial(_leg, scene, push, rest, path.shape[0] > 2)
-    return along_legs(scene, height, path, push.rate, leg, record)
+    return along_legs(scene, height, path, push.rate, leg, record, rises=True)
 
 
 def _leg(
@@ -84,7 +84,7 @@ def _leg(
         far = lax.stop_gradient(_far(job.tool.width / dx, job.tool.thickness / dx))
         state = h, lost, jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, edge), kept
 
-    def way(pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
+    def way(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
         half, side = (jnp.asarray(extent) / dx / 2 for extent in (job.tool.thickness, job.tool.width))
         return way_of(job, pose, length, angle, half, side)
 

@@ -27,6 +27,7 @@ from jaxsand.scene.window import Whole, Window
 
 Rules = tuple[PushRule, Scheme, Stop]
 Result = TypeVar("Result", Pushed, "Shaped", tuple["Shaped", jax.Array])
+STROKES = (4, 6)  # numbers of a stroke: x, y of its start and end, or x, y, z
 _SURE = 1.5  # times the width of a window that a stroke asks for, where there is no second try
 
 
@@ -267,8 +268,9 @@ def rollout(
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     strokes = as_array("strokes", strokes, height.dtype, POINTS)
-    if strokes.ndim != 2 or strokes.shape[1] != 4:
-        raise ValueError(f"strokes: got shape {list(strokes.shape)}; give [n, 4], a row x0, y0, x1, y1 for each push")
+    if strokes.ndim != 2 or strokes.shape[1] not in STROKES:
+        remedy = "give a row x0, y0, x1, y1 [n, 4] or x0, y0, z0, x1, y1, z1 [n, 6] for each push"
+        raise ValueError(f"strokes: got shape {list(strokes.shape)}; {remedy}")
     return _as_needed(lambda scene, _: _rollout(scene, height, strokes, rules), scene, rules, (height, strokes))
 
 
@@ -296,7 +298,7 @@ def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
     """
     if not path.size:
         return Whole()
-    far = float(np.max(np.ptp(np.asarray(path), axis=0))) / float(scene.grid.spacing)
+    far = float(np.max(np.ptp(np.asarray(path)[:, :2], axis=0))) / float(scene.grid.spacing)
     if isinstance(scheme, Pairwise | Multilevel) or not isinstance(scene.window, Window) or not far < max(scene.grid.shape):
         return Whole()
     size = 1 << math.ceil(math.log2(far + 2 * max(scene.window.size)))
@@ -333,19 +335,20 @@ def ready(
     return fitted, height, cast((push, scheme, stop), height.dtype)
 
 
-def _stroke(stroke: ArrayLike, dtype: DTypeLike) -> Float[Array, "2 2"]:
+def _stroke(stroke: ArrayLike, dtype: DTypeLike) -> Float[Array, "2 _"]:
     """The stroke's start and end as a path; ValueError if it has the wrong shape."""
     stroke = as_array("stroke", stroke, dtype, POINTS)
-    if stroke.shape != (4,):
-        remedy = "use jax.vmap" if stroke.ndim > 1 and stroke.shape[-1] == 4 else "give x0, y0, x1, y1 in metres"
+    if stroke.ndim != 1 or stroke.size not in STROKES:
+        many = stroke.ndim > 1 and stroke.shape[-1] in STROKES
+        remedy = "use jax.vmap" if many else "give x0, y0, x1, y1 in metres, or x0, y0, z0, x1, y1, z1"
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
-    return stroke.reshape(2, 2)
+    return stroke.reshape(2, -1)
 
 
-def _path(path: ArrayLike, dtype: DTypeLike) -> Float[Array, "n 2"]:
+def _path(path: ArrayLike, dtype: DTypeLike) -> Float[Array, "n _"]:
     path = as_array("path", path, dtype, POINTS)
-    if path.ndim != 2 or path.shape[0] < 2 or path.shape[1] != 2:
-        remedy = "use jax.vmap" if path.ndim > 2 else "give at least two points [n, 2] of x, y in metres"
+    if path.ndim != 2 or path.shape[0] < 2 or 2 * path.shape[1] not in STROKES:
+        remedy = "use jax.vmap" if path.ndim > 2 else "give at least two points x, y [n, 2] or x, y, z [n, 3] in metres"
         raise ValueError(f"path: got shape {list(path.shape)}; {remedy}")
     return path
 
@@ -386,7 +389,7 @@ def _act(scene: Scene, height: jax.Array, path: jax.Array, rules: Rules) -> Push
 @jax.jit
 def _rollout(scene: Scene, height: jax.Array, strokes: jax.Array, rules: Rules) -> Shaped:
     def one(height: jax.Array, stroke: jax.Array) -> tuple[jax.Array, Shaped]:
-        shaped, _ = _follow(scene, height, stroke.reshape(2, 2), rules)
+        shaped, _ = _follow(scene, height, stroke.reshape(2, -1), rules)
         return shaped.height, shaped
 
     return jax.lax.scan(one, height, strokes)[1]

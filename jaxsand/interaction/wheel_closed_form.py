@@ -84,7 +84,7 @@ def push_split(
 def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -> jax.Array:
     """One leg: takes up the sand of the cut and sets it down in piles beside it, slice by slice along the leg."""
     dx, wheel = job.bed.spacing, job.tool
-    pose, length = over_the_map(scene, job, pose, length)
+    _, pose, length = over_the_map(scene, job, pose, length)
     side = jnp.where(wheel.slip_angle < 0, -1, 1)
     s, n = local(pose, job.x, job.y)
     n = n * side  # the flank leads on the positive side
@@ -121,7 +121,7 @@ def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """The widths of the cut made by the rim and by a flank (m), the share of its sand that goes to the side of the leading
     flank, and the height of its floor (m)."""
     slip = jnp.abs(wheel.slip_angle)
-    rim, flank = wheel.width * jnp.cos(slip), half_chord(wheel) * jnp.sin(slip)
+    rim, flank = wheel.width * jnp.cos(slip), half_chord(wheel.radius, wheel.sinkage) * jnp.sin(slip)
     flanks, middle = 4 / 3 * flank * wheel.sinkage, wheel.sinkage * rim
     alike = (slip < _TEN) | (jnp.abs(slip - math.pi / 2) < _TEN) | (flanks <= middle)
     if isinstance(wheel.grousers, Grousers):
@@ -151,7 +151,7 @@ def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax
 def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Array, h: jax.Array) -> jax.Array:
     """The height of sand that the wheel cuts from each cell [H, W] (m): what lies above its lowest pass and the floor."""
     wheel = job.tool
-    slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, half_chord(wheel)
+    slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, half_chord(wheel.radius, wheel.sinkage)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
     least = float(jnp.finfo(h.dtype).eps)
     least_cos, least_sin = jnp.maximum(cos, least), jnp.maximum(sin, least)

@@ -43,7 +43,7 @@ def roll_along(
     """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
 
     leg = partial(_leg, scene, push, path.shape[0] > 2)
-    return along_legs(scene, height, path, push.rate, leg, record)
+    return along_legs(scene, height, path, push.rate, leg, record, rises=True)
 
 
 def _leg(
@@ -68,12 +68,13 @@ def _leg(
         Roll(block, substep=substep, sweeps=sweeps, chunk=chunk(substep), lowered=before is None, keeps=keeps),
         4 * math.hypot(*shape) + 3,  # make_scene holds radius and width below the map's diagonal
     )
-    return moved(scene, job, steps, partial(_track, job), pose, length, before, state)
+    return moved(scene, job, steps, _track, pose, length, before, state)
 
 
 def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
     """A leg of the wheel in spacings; `angle` is the turn in place before it (rad)."""
     dx, wheel = job.bed.spacing, job.tool
-    way = way_of(job, pose, length, angle, half_chord(wheel) / dx, jnp.asarray(wheel.width) / dx / 2)
+    deep = wheel.sinkage if job.rise is None else -jnp.minimum(job.bottom, job.bottom + length * job.rise)  # where deepest
+    way = way_of(job, pose, length, angle, half_chord(wheel.radius, deep) / dx, jnp.asarray(wheel.width) / dx / 2)
     carried = None if isinstance(wheel.grousers, Smooth) else carried_area(wheel, wheel.grousers) / dx
     return Track(way, jnp.asarray(wheel.radius) / dx, jnp.asarray(wheel.slip_angle), carried)

@@ -217,10 +217,10 @@ def usable(tool: Tool) -> Bool[Array, ""]:
     return good
 
 
-def half_chord(wheel: Wheel) -> Scalar:
-    """Half of the wheel's chord at level sand, s = sqrt(h (2 r - h)) (m); at least a thousandth of the radius."""
-    r = jnp.asarray(wheel.radius)
-    return jnp.sqrt(jnp.maximum(wheel.sinkage * (2 * r - wheel.sinkage), 1e-6 * r * r))
+def half_chord(radius: Number, sinkage: Number) -> Scalar:
+    """Half of a wheel's chord at level sand, s = sqrt(h (2 r - h)) (m); at least a thousandth of the radius."""
+    r = jnp.asarray(radius)
+    return jnp.sqrt(jnp.maximum(sinkage * (2 * r - sinkage), 1e-6 * r * r))
 
 
 def carried_area(wheel: Wheel, grousers: Grousers) -> Scalar:
@@ -228,9 +228,13 @@ def carried_area(wheel: Wheel, grousers: Grousers) -> Scalar:
     return jnp.asarray(grousers.spin * wheel.width * grousers.height * grousers.fill)
 
 
-def extent(tool: Blade | Wheel) -> Scalar:
-    """The order of magnitude of the heights (m) that the tool can make, up or down; sets the precision of a push."""
-    return jnp.asarray(tool.radius) if isinstance(tool, Wheel) else jnp.abs(jnp.asarray(tool.depth))
+def extent(tool: Blade | Wheel, heights: Float[Array, "n k"]) -> Scalar:
+    """The order of magnitude of the heights (m) that the tool can make, up or down; sets the precision of a push.
+
+    `heights` are those of its lowest point on its way [n, 1], or [n, 0] if it stays at its own depth.
+    """
+    deep = jnp.max(jnp.maximum(-heights, 0)) if heights.size else jnp.abs(lowest(tool))
+    return jnp.maximum(tool.radius, deep) if isinstance(tool, Wheel) else deep
 
 
 def reach(tool: Blade | Wheel) -> Scalar:

@@ -95,8 +95,8 @@ def plan_sand(
       strokes: the largest number of strokes, or of legs.
       actions: `Lattice()` for strokes with the tool lifted in between (the default), `Steps()` for one path with the tool
         down.
-      budget: how many full pushes the search may cost at most; a rough push (`SwathPush()`, 8 sweeps) counts as 1/12. With too few for what it does
-        at each stroke, it tries fewer strokes, or none.
+      budget: how many full pushes the search may cost at most; a rough push (`SwathPush()`, 8 sweeps) counts as 1/12. With
+        too few for what it does at each stroke, it tries fewer strokes, or none.
       seed: equal seeds give equal plans.
 
     Returns:
