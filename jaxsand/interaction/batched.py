@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.rule import PushRule
-from jaxsand.interaction.simulate import STROKES, Rules, Shaped, lifted, ready, step, windows_for
+from jaxsand.interaction.simulate import STROKES, Rules, Shaped, Strokes, lifted, ready, step, windows_for
 from jaxsand.relaxation.batching import in_groups, in_turns, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
@@ -35,7 +35,7 @@ _GRADIENTS = 32  # the most maps that are differentiated together, on a CPU
 def step_batch(
     scene: Scene,
     height: Float[ArrayLike, "B H W"],
-    stroke: Float[ArrayLike, "B 4"],
+    stroke: Strokes,
     *,
     push: PushRule | None = None,
     scheme: Scheme | None = None,
@@ -50,7 +50,7 @@ def step_batch(
     Args:
         scene: the scene of all maps, with the tool.
         height: height maps [B, H, W] (m).
-        stroke: one stroke [4] = x0, y0, x1, y1 (m) for each map, [B, 4].
+        stroke: one stroke for each map, as of `step`: [B, 4], or [B, 6] with heights.
         push: as of `step`.
         scheme: as of `settle`.
         stop: as of `settle`.
@@ -77,7 +77,7 @@ def step_batch(
 def act_batch(
     scene: Scene,
     height: Float[ArrayLike, "B H W"],
-    stroke: Float[ArrayLike, "B 4"],
+    stroke: Strokes,
     *,
     push: PushRule | None = None,
     chunk: int | None = None,
@@ -90,13 +90,13 @@ def value_and_grad_batch(
     scene: Scene,
     loss: Loss,
     height: Float[ArrayLike, "B H W"],
-    stroke: Float[ArrayLike, "B 4"],
+    stroke: Strokes,
     *args: Tree,
     push: PushRule | None = None,
     scheme: Scheme | None = None,
     stop: Stop | None = None,
     chunk: int | None = None,
-) -> tuple[Float[Array, " B"], tuple[Float[Array, "B H W"], Float[Array, "B 4"]]]:
+) -> tuple[Float[Array, " B"], tuple[Float[Array, "B H W"], Float[Array, "B _"]]]:
     """A loss of what each stroke of a batch leaves, and its gradient with respect to map and stroke, on every core.
 
     For each map it computes loss(step(scene, height, stroke).height, *args) and differentiates that. Call it from plain
@@ -108,7 +108,7 @@ def value_and_grad_batch(
         loss: a function of a settled map [H, W] (m) and of its part of `args` that returns one floating-point number. Pass
             the same function in every call: each new one is compiled anew, which takes a quarter of a minute.
         height: height maps [B, H, W] (m) before the pushes.
-        stroke: one stroke [4] = x0, y0, x1, y1 (m) for each map, [B, 4].
+        stroke: one stroke for each map, as of `step`: [B, 4], or [B, 6] with heights.
         *args: arrays, or pytrees of arrays, with a leading axis of length B: such as one goal for each map.
         push: as of `step`.
         scheme: as of `settle`.
@@ -116,8 +116,8 @@ def value_and_grad_batch(
         chunk: number of maps that are computed together, 1 or more; None for what suits the machine.
 
     Returns:
-        The losses [B], and a pair of gradients: by the maps [B, H, W], and by the strokes [B, 4]. They are NaN where the
-        outcome is NOT_FINITE, or where sand reached the edge of a `Window` that the scene was given.
+        The losses [B], and a pair of gradients: by the maps [B, H, W], and by the strokes [B, 4] or [B, 6]. They are NaN
+        where the outcome is NOT_FINITE, or where sand reached the edge of a `Window` that the scene was given.
 
     Raises:
         ValueError: as of `step_batch`, or the loss is no hashable function, or returns anything but one

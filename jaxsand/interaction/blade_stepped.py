@@ -5,7 +5,8 @@ of a spacing. In each, the sand that it newly covers is displaced along the norm
 around it is brought to rest (resting.py). When the blade is lowered, the sand that it covers is displaced along the gradient
 of (s / thickness)^2 + (n / width)^2, with s along and n across the blade. At a corner the blade turns in place, by the
 smaller angle, in sub-steps of an angle; the sand that it sweeps is displaced along the normals of its faces. A reversal is
-half a turn, to the left.
+half a turn, to the left. Where the bottom sinks on the way, the sand that comes to lie above it leaves to the front too;
+under a bottom that rises, the floor is where the front left it (`Advance.floor`).
 
 Source: arXiv:1908.02745, "Tool Interaction"; shares of a cell in place of whole ones make the result continuous in the
 stroke.
@@ -47,12 +48,12 @@ Length = TypeVar("Length", float, jax.Array)
 def push_along(
     scene: Scene,
     height: Float[Array, "H W"],
-    path: Float[Array, "n 2"],
+    path: Float[Array, "n _"],
     push: "SteppedPush",
     record: Record | None = None,
     rest: Rest = bring_to_rest,
 ) -> tuple[Pushed, Tree]:
-    """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`.
+    """Lowers the blade at path[0], moves it along the legs of `path` (m) and lifts it; see `along_legs`.
 
     `rest` is the function that brings the sand to rest after each sub-step.
     """

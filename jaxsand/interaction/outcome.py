@@ -28,7 +28,8 @@ _ADVICE = {
         "tolerance, or, where heights are large against the spacing, subtract their mean or use float64"
     ),
     Outcome.NOT_FINITE: (
-        "the map, the stroke or the scene holds a NaN or an infinity, or heights overflowed: look with numpy.isfinite"
+        "the map, the stroke or the scene holds a NaN or an infinity, heights overflowed, or a leg leads straight up or "
+        "down: look with numpy.isfinite, and give every leg with heights a length"
     ),
 }
 

@@ -32,7 +32,7 @@ class PushRule(Protocol):
         self,
         scene: Scene,
         height: Float[Array, "H W"],
-        path: Float[Array, "n 2"],
+        path: Float[Array, "n _"],
         record: Record | None = None,
     ) -> tuple[Pushed, Tree]:
         """Lowers the tool at path[0], moves it along the legs of the path (m) and lifts it; the sand is not settled.
@@ -42,7 +42,8 @@ class PushRule(Protocol):
         Args:
             scene: the scene; its numbers have the height's dtype.
             height: the map [H, W] (m) before.
-            path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2.
+            path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2; or [n, 3], with the height of its
+                lowest point. A rule that keeps its tool at one depth raises ValueError for these.
             record: what to keep of the map after each leg, for animations.
 
         Returns:

@@ -28,6 +28,9 @@ from jaxsand.scene.window import Whole, Window
 Rules = tuple[PushRule, Scheme, Stop]
 Result = TypeVar("Result", Pushed, "Shaped", tuple["Shaped", jax.Array])
 STROKES = (4, 6)  # numbers of a stroke: x, y of its start and end, or x, y, z
+Stroke = Float[ArrayLike, "4"] | Float[ArrayLike, "6"]
+Strokes = Float[ArrayLike, "n 4"] | Float[ArrayLike, "n 6"]
+Path = Float[ArrayLike, "n 2"] | Float[ArrayLike, "n 3"]
 _SURE = 1.5  # times the width of a window that a stroke asks for, where there is no second try
 
 
@@ -58,9 +61,7 @@ class Shaped(Settled):
     pose: Pose
 
 
-def act(
-    scene: Scene, height: Float[ArrayLike, "H W"], stroke: Float[ArrayLike, "4"], *, push: PushRule | None = None
-) -> Pushed:
+def act(scene: Scene, height: Float[ArrayLike, "H W"], stroke: Stroke, *, push: PushRule | None = None) -> Pushed:
     """One straight push without settling: the map just after the tool was lifted.
 
     Sand that was not at rest when the tool was lifted stays as it is; `step` lets it settle too. Differentiable like `step`.
@@ -68,7 +69,7 @@ def act(
     Args:
         scene: the scene, with the tool.
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
-        stroke: start and end of the tool's centre [4] = x0, y0, x1, y1 (m).
+        stroke: as of `step`.
         push: `SteppedPush` (the default), `SwathPush` for a blade, `SplitPush` for a wheel, or another `PushRule`.
 
     Returns:
@@ -94,7 +95,7 @@ def act(
 def step(
     scene: Scene,
     height: Float[ArrayLike, "H W"],
-    stroke: Float[ArrayLike, "4"],
+    stroke: Stroke,
     *,
     push: PushRule | None = None,
     scheme: Scheme | None = None,
@@ -103,9 +104,9 @@ def step(
     """One straight push, then settling.
 
     The tool is lowered at the start of the stroke, moved to its end, and lifted. Then the sand settles. Parts of a stroke
-    off the map touch nothing. A stroke of no length lowers and lifts the tool, facing +x. A stroke that is not finite leaves
-    the map as it is, and the outcome says NOT_FINITE. At a wall or a closed edge the sand ahead of a blade has nowhere to
-    go: it stays in its cells, inside the blade, and flows off when the blade is lifted.
+    off the map touch nothing. A stroke of no length lowers and lifts the tool, facing +x. A stroke that is not finite, or
+    leads straight up or down, leaves the map as it is, and the outcome says NOT_FINITE. At a wall or a closed edge the sand
+    ahead of a blade has nowhere to go: it stays in its cells, inside the blade, and flows off when the blade is lifted.
 
     Differentiable once, in forward and reverse mode, in the height, the stroke, the angle of repose and the tool. The
     derivative is exactly zero where the push changes nothing (a stroke off the map, a tool above the sand). The result is
@@ -115,7 +116,8 @@ def step(
         scene: the scene, with the tool.
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx. Use `jax.vmap` or
             `step_batch` for many.
-        stroke: start and end of the tool's centre [4] = x0, y0, x1, y1 (m).
+        stroke: start and end of the tool's centre [4] = x0, y0, x1, y1 (m), at the tool's own depth; or [6] = x0, y0, z0,
+            x1, y1, z1 (m), with z the height of the tool's lowest point, which rises or sinks evenly on the way.
         push: how the tool moves the sand: `SteppedPush` (the default), `SwathPush` for a blade, `SplitPush` for a wheel, or
             another `PushRule`.
         scheme: scheme of settling, as of `settle`.
@@ -149,7 +151,7 @@ def step(
 def follow(
     scene: Scene,
     height: Float[ArrayLike, "H W"],
-    path: Float[ArrayLike, "n 2"],
+    path: Path,
     *,
     push: PushRule | None = None,
     scheme: Scheme | None = None,
@@ -165,7 +167,8 @@ def follow(
     Args:
         scene: the scene, with the tool.
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
-        path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2.
+        path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2; or [n, 3] = x, y, z (m), with z the
+            height of the tool's lowest point, linear along each leg. The tool may begin or end in the air.
         push: as of `step`.
         scheme: as of `settle`.
         stop: as of `settle`.
@@ -193,7 +196,7 @@ def follow(
 def follow_frames(
     scene: Scene,
     height: Float[ArrayLike, "H W"],
-    path: Float[ArrayLike, "n 2"],
+    path: Path,
     *,
     push: PushRule | None = None,
     scheme: Scheme | None = None,
@@ -204,7 +207,8 @@ def follow_frames(
     Args:
         scene: the scene, with the tool.
         height: height map [H, W] (m).
-        path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2.
+        path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2; or [n, 3] = x, y, z (m), with z the
+            height of the tool's lowest point, linear along each leg. The tool may begin or end in the air.
         push: as of `step`.
         scheme: as of `settle`.
         stop: as of `settle`.
@@ -232,7 +236,7 @@ def follow_frames(
 def rollout(
     scene: Scene,
     height: Float[ArrayLike, "H W"],
-    strokes: Float[ArrayLike, "n 4"],
+    strokes: Strokes,
     *,
     push: PushRule | None = None,
     scheme: Scheme | None = None,
@@ -246,7 +250,7 @@ def rollout(
     Args:
         scene: the scene, with the tool.
         height: height map [H, W] (m) before the first push.
-        strokes: one row [4] = x0, y0, x1, y1 (m) for each push, [n, 4].
+        strokes: one row for each push, as of `step`: [n, 4] or [n, 6].
         push: as of `step`.
         scheme: as of `settle`.
         stop: as of `settle`.

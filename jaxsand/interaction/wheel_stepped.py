@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 
 def roll_along(
-    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 2"], push: "SteppedPush", record: Record | None = None
+    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n _"], push: "SteppedPush", record: Record | None = None
 ) -> tuple[Pushed, Tree]:
-    """Lowers the wheel at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
+    """Lowers the wheel at path[0], moves it along the legs of `path` (m) and lifts it; see `along_legs`."""
 
     leg = partial(_leg, scene, push, path.shape[0] > 2)
     return along_legs(scene, height, path, push.rate, leg, record, rises=True)

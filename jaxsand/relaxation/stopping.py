@@ -24,7 +24,8 @@ class Outcome(IntFlag):
         NOT_STILL: some slope still exceeds repose by more than the stop rule's tolerance.
         WINDOW_EDGE: sand moved at the edge of a window, so that the result may differ from that of the whole map.
         NOT_FINITE: the map, the stroke or the scene holds a NaN or an infinity, heights overflowed, or the stroke lies
-            farther away than floats resolve. A bad cell of the map was treated as solid and is returned as it was.
+            farther away than floats resolve or leads straight up or down. A bad cell of the map was treated as solid and is
+            returned as it was.
 
     Example:
         >>> import jaxsand as js
