@@ -48,6 +48,19 @@ class Ready:
         return Stand(self.sand.gates, self.sand.open, self.sand.stretch)
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Cut:
+    """What a blade does in a sub-step: the leg, with the bottom where the blade is now; its footprints; whether it moves, or
+    has just come down; which share of a whole sub-step this one is; and what leaves the cells near the blade (quanta)."""
+
+    way: Way
+    reach: blade.Reach
+    moving: jax.Array
+    part: jax.Array
+    taken: jax.Array
+
+
 @dataclass(frozen=True)
 class Step:
     """A step of a loop that computes a batch in the last axis; see while_loop.py."""
@@ -146,33 +159,48 @@ class Advance(Step):
         self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: State
     ) -> tuple[Ready, jax.Array | None]:
         """Sub-step i of step k up to when the sand comes to rest, and what was lost."""
-        h, flux, clear = state
-        frame = frame_of(self.block.shape, way.start)
-        pose, (along, across) = frame.pose, self.block.coordinates(frame, first)
+        cut = self.cut(way, k, first, i, self.block.part(state[0]))
+        return self.displaced(cut, rate, view, state, cut.taken)
+
+    def cut(self, way: Way, k: jax.Array, first: First, i: jax.Array, near: jax.Array) -> Cut:
+        """What the blade cuts in sub-step i of step k from the heights `near` it."""
+        along, across = self.block.coordinates(frame_of(self.block.shape, way.start), first)
         side = spread(way.side, across)
         beside = lax.optimization_barrier(blade.share(across, -side, side))
         moving = k >= int(self.lowered)
         begin = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(way.length.dtype) * self.substep
         begin = jnp.minimum(begin, way.length)
         ahead = jnp.where(moving, jnp.minimum(way.length - begin, self.substep), 0)
-        part = jnp.where(moving, ahead / self.substep, 1)
         half, further = spread(way.half, along), spread(ahead, along)
         reach = blade.straight(along - spread(begin, along), beside, half, further)
-        near = self.block.part(h)
         if way.rise is None:
             taken = blade.cleared(reach, near, spread(way.bottom / way.quantum, near))
         else:
-            old, new = (self.floor(way, reach, by) for by in (begin, begin + ahead))
-            taken = blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near))
-            way = replace(way, bottom=new * spread(way.quantum, near))
-        taken = jnp.where(ahead > 0, taken, 0)
+            taken, floor = self.beneath(way, reach, near, begin, ahead)
+            way = replace(way, bottom=floor * spread(way.quantum, near))
+        return Cut(way, reach, moving, jnp.where(moving, ahead / self.substep, 1), jnp.where(ahead > 0, taken, 0))
+
+    def beneath(
+        self, way: Way, reach: blade.Reach, near: jax.Array, begin: jax.Array, ahead: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """What a blade whose bottom rises or sinks takes up, and its bottom over each cell afterwards (quanta)."""
+        assert way.rise is not None
+        old, new = (self.floor(way, reach, by) for by in (begin, begin + ahead))
+        return blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near)), new
+
+    def displaced(
+        self, cut: Cut, rate: jax.Array, view: View, state: State, taken: jax.Array
+    ) -> tuple[Ready, jax.Array | None]:
+        """The sand after `taken` of what was cut has left to the front, yet to come to rest, and what was lost."""
+        h, flux, clear = state
+        way, pose = cut.way, frame_of(self.block.shape, cut.way.start).pose
         room = self.block.part(view.holds if view.beyond is None else view.holds + view.beyond)
-        shares = blade.onward(spread(pose.cos, near), spread(pose.sin, near), room)
+        shares = blade.onward(spread(pose.cos, taken), spread(pose.sin, taken), room)
         h, lost = self.block.displaced(way, view, shares, h, taken)
-        around = self.block.around(view, reach)
+        around = self.block.around(view, cut.reach)
         sand = self.block.sand(way, view, clear, around)
-        guess = self.block.guess(around.gates, jnp.where(moving, part, 0), flux)
-        return Ready(around, way.bottom / way.quantum, sand, rate * part, h, guess, part), lost
+        guess = self.block.guess(around.gates, jnp.where(cut.moving, cut.part, 0), flux)
+        return Ready(around, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
 
     def floor(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
         """The blade's bottom over each cell near it (quanta), when it has moved by a length (spacings).

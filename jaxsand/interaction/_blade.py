@@ -30,6 +30,7 @@ _LEAVES = 0.125  # spacings that the blade moves until sand inside it has left
 Shares = dict[tuple[int, int], jax.Array]
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Reach:
     """The footprints of a blade that moves; all are maps of a block with ghost cells.

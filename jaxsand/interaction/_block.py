@@ -38,6 +38,7 @@ class Way:
         level: height of a draining rim, or None.
         rate: rate of the proximal steps.
         angle: angle by which the blade turns in place before the leg (rad).
+        room: what the tool's bucket holds when full (quanta), or None if it has none.
     """
 
     start: Pose
@@ -52,6 +53,7 @@ class Way:
     rate: jax.Array
     angle: jax.Array
     rise: jax.Array | None
+    room: jax.Array | None = None
 
     def at(self, by: jax.Array) -> "Way":
         """The leg as it is when the blade has moved by a length (spacings): with its bottom at the height there."""
@@ -68,12 +70,14 @@ class Moving:
         lost: account of what drained, flat maps; see `ghost_cells.lose`.
         flux: fluxes of the last sub-step in the block around the blade (quanta).
         edge: largest change of height at the block's edge so far (spacings).
+        scooped: account (quanta) of what a bucket took up so far, a pair of numbers, or None for other tools.
     """
 
     height: jax.Array
     lost: Lost
     flux: Fluxes
     edge: jax.Array
+    scooped: Lost = None
 
 
 @jax.tree_util.register_dataclass

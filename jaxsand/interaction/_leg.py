@@ -67,10 +67,10 @@ def moved(
 ) -> State:
     """Lowers the tool, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
     shape, dx, block, substep = scene.grid.shape, job.bed.spacing, steps.ahead.block, steps.ahead.substep
-    h, lost, edge, kept = state
-    none = no_flux(block.neighbours, block.drains, jnp.zeros((block.size, block.size), h.dtype))
-    flat, gone = jax.tree.map(lambda x: x.reshape(-1), (h, lost))
-    sand = Moving(flat, gone, none, edge)
+    kept = state.kept
+    none = no_flux(block.neighbours, block.drains, jnp.zeros((block.size, block.size), state.height.dtype))
+    flat, gone = jax.tree.map(lambda x: x.reshape(-1), (state.height, state.lost))
+    sand = Moving(flat, gone, none, state.moved, state.scooped)
     zero = jnp.zeros_like(length)
     nowhere = Laid(none, jnp.int32(0), jnp.int32(0))
     if before is None:
@@ -98,7 +98,7 @@ def moved(
         last = count - 1 - int(before is None)
         kept = replace(kept, ahead=lay(block, frame, first(last), sand.flux), since=kept.since + length / dx)
     h, lost = jax.tree.map(lambda x: x.reshape(shape), (sand.height, sand.lost))
-    return h, lost, sand.edge, kept
+    return State(h, lost, sand.edge, kept, sand.scooped)
 
 
 def _turned(

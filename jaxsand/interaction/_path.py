@@ -59,8 +59,26 @@ class Pushed:
     pose: Pose
 
 
-# height, height lost over the rim, movement at the window's edge, and what a rule keeps from leg to leg: () before the first
-State = tuple[jax.Array, Lost, jax.Array, Tree]
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    """What a leg is handed and hands on.
+
+    Attributes:
+        height: the map [H, W] (m), NaN where there is no sand.
+        lost: account of what drained; see `ghost_cells.lose`.
+        moved: largest change of height at the window's edge so far (spacings).
+        kept: what the rule keeps from leg to leg; () before the first.
+        scooped: account (quanta) of what a bucket took up, as of `ghost_cells.counted`; None for other tools.
+    """
+
+    height: jax.Array
+    lost: Lost
+    moved: jax.Array
+    kept: Tree
+    scooped: Lost
+
+
 Leg = Callable[[Job, Pose, jax.Array, Pose | None, State], State]
 Record = Callable[[jax.Array], Tree]  # what to note of the height [H, W] (m) after each leg
 
@@ -113,7 +131,7 @@ def along_legs(
     moved = jnp.zeros_like(job.bottom)
     if isinstance(scene.window, Window):
         moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
-    state: State = (intact, lost, moved, ())
+    state = State(intact, lost, moved, (), None)
 
     def at_height(start: jax.Array, stop: jax.Array, length: jax.Array) -> Job:
         if not start.size:
@@ -123,14 +141,14 @@ def along_legs(
 
     pose, length = _heading(path[0], path[1], None)
     state = leg(at_height(heights[0], heights[1], length), pose, length, None, state)
-    frames = [record(unmark(state[0], height))] if record else []
+    frames = [record(unmark(state.height, height))] if record else []
 
     def later_leg(carry: tuple[Pose, State], points: tuple[jax.Array, ...]) -> tuple[tuple[Pose, State], Tree]:
         before, state = carry
         pose, length = _heading(points[0], points[1], before)
         job = at_height(points[2], points[3], length)
         state = leg(job, pose, length, Pose(pose.x, pose.y, before.cos, before.sin), state)
-        return (pose, state), record(unmark(state[0], height)) if record else ()
+        return (pose, state), record(unmark(state.height, height)) if record else ()
 
     if path.shape[0] > 2:
         (pose, state), rest = lax.scan(later_leg, (pose, state), (path[1:-1], path[2:], heights[1:-1], heights[2:]))
@@ -138,7 +156,7 @@ def along_legs(
             frames = jax.tree.map(lambda first, more: jnp.concatenate([first[None], more]), frames[0], rest)
     elif record:
         frames = jax.tree.map(lambda first: first[None], frames[0])
-    marked, lost, moved, _ = state
+    marked, lost, moved = state.height, state.lost, state.moved
     edge = jnp.zeros((), bool)
     if isinstance(scene.window, Window):
         edge = moved > scene.window.tolerance

@@ -115,14 +115,15 @@ def push_swath(
     scene = replace(scene, window=Whole())
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        h, lost, moved, kept = state
+        h, lost = state.height, state.lost
         if before is None:
             old = jnp.zeros_like(h)
         else:
             old = coverage(job.tool, before, job.x, job.y, job.bed.spacing)
             flow = replace(job.flow, rate=job.flow.rate * contact(job, old, h))
             h, lost = settle_around(job, flow, push.sweeps, old, h, lost)
-        return *_sweep_out(scene, job, pose, length, old, before is None, h, lost), moved, kept
+        h, lost = _sweep_out(scene, job, pose, length, old, before is None, h, lost)
+        return replace(state, height=h, lost=lost)
 
     return along_legs(scene, height, path, push.rate, leg, record)
 

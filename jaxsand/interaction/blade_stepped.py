@@ -81,9 +81,8 @@ def _leg(
         near = min(size, scene.window.near or size)
     block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, job.bed.rim is not None)
     if near < size:  # a traced blade may be larger than the one for which the window was made
-        h, lost, edge, kept = state
         far = lax.stop_gradient(_far(job.tool.width / dx, job.tool.thickness / dx))
-        state = h, lost, jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, edge), kept
+        state = replace(state, moved=jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, state.moved))
 
     def way(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
         half, side = (jnp.asarray(extent) / dx / 2 for extent in (job.tool.thickness, job.tool.width))

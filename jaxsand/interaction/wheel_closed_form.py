@@ -75,8 +75,7 @@ def push_split(
     scene = replace(scene, window=Whole())
 
     def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        h, *rest = state
-        return _pass(scene, job, pose, length, h), *rest
+        return replace(state, height=_pass(scene, job, pose, length, state.height))
 
     return along_legs(scene, height, path, 0.125, leg, record)
 
