@@ -17,8 +17,15 @@ if TYPE_CHECKING:
     from jaxsand.interaction.batched import step_batch as step_batch
     from jaxsand.interaction.batched import value_and_grad_batch as value_and_grad_batch
     from jaxsand.interaction.blade_closed_form import SwathPush as SwathPush
+    from jaxsand.interaction.bucket import Load as Load
+    from jaxsand.interaction.bucket import Loaded as Loaded
+    from jaxsand.interaction.bucket import dump as dump
+    from jaxsand.interaction.bucket import load_volume as load_volume
+    from jaxsand.interaction.bucket import scoop as scoop
     from jaxsand.interaction.outcome import OutcomeError as OutcomeError
     from jaxsand.interaction.outcome import check as check
+    from jaxsand.interaction.pouring import deposit as deposit
+    from jaxsand.interaction.pouring import remove as remove
     from jaxsand.interaction.rule import PushRule as PushRule
     from jaxsand.interaction.simulate import Shaped as Shaped
     from jaxsand.interaction.simulate import act as act
@@ -59,6 +66,7 @@ if TYPE_CHECKING:
     from jaxsand.scene.scene import make_scene as make_scene
     from jaxsand.scene.scene import volume as volume
     from jaxsand.scene.tools import Blade as Blade
+    from jaxsand.scene.tools import Bucket as Bucket
     from jaxsand.scene.tools import Grousers as Grousers
     from jaxsand.scene.tools import NoTool as NoTool
     from jaxsand.scene.tools import Pose as Pose
@@ -83,6 +91,7 @@ _HOMES = {
     "AsNeeded": "scene.window",
     "Blade": "scene.tools",
     "Blurred": "planning.gradient",
+    "Bucket": "scene.tools",
     "Calibration": "terramechanics._least_squares",
     "Closed": "scene.boundaries",
     "DRY_SAND": "scene.material",
@@ -90,6 +99,8 @@ _HOMES = {
     "Grid": "scene.grid",
     "Grousers": "scene.tools",
     "Lattice": "planning.search.actions",
+    "Load": "interaction.bucket",
+    "Loaded": "interaction.bucket",
     "Material": "scene.material",
     "Multilevel": "relaxation.schemes",
     "NoTool": "scene.tools",
@@ -129,14 +140,19 @@ _HOMES = {
     "calibrate": "terramechanics.calibration",
     "calibrate_sections": "terramechanics.sections",
     "check": "interaction.outcome",
+    "deposit": "interaction.pouring",
+    "dump": "interaction.bucket",
     "follow": "interaction.simulate",
     "follow_frames": "interaction.simulate",
+    "load_volume": "interaction.bucket",
     "make": "envs",
     "make_scene": "scene.scene",
     "optimise_strokes": "planning.gradient",
     "plan": "planning.binary",
     "plan_sand": "planning.search",
+    "remove": "interaction.pouring",
     "rollout": "interaction.simulate",
+    "scoop": "interaction.bucket",
     "settle": "relaxation.settling",
     "settle_batch": "relaxation.settling",
     "steepest_slope": "relaxation.settling",

@@ -21,7 +21,7 @@ from jaxsand.interaction._resting_adjoint import Rested, blank, rest_pulled, res
 from jaxsand.interaction.resting import Links, Sand, bring_to_rest
 from jaxsand.interaction.stencil import inner, spread
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.relaxation.ghost_cells import at, halo
+from jaxsand.relaxation.ghost_cells import Lost, at, halo
 
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 
@@ -123,20 +123,25 @@ class Advance(Step):
         cover, rate = self.felt(way, k, first, view, old)
         gone = jnp.zeros_like(old) if self.block.drains else None
 
-        def substep(i: jax.Array, carry: tuple[State, jax.Array | None]) -> tuple[State, jax.Array | None]:
-            state, gone = carry
-            ready, lost = self.ready(way, rate, k, first, view, i, state)
-            h, flux = self.rest(ready.sand, ready.rate, self.sweeps, ready.height, ready.guess)
+        def substep(i: jax.Array, carry: tuple[State, jax.Array | None, Lost]) -> tuple[State, jax.Array | None, Lost]:
+            (h, flux, stand), gone, scooped = carry
+            cut = self.cut(way, k, first, i, self.block.part(h))
+            taken = cut.taken
+            if way.room is not None:
+                into, scooped = blade.scooped(way.room, scooped, taken * at(self.block.part(view.holds)))
+                h, taken = self.block.put(h, self.block.part(h) - into), taken - into
+            ready, lost = self.displaced(cut, rate, view, (h, flux, stand), taken)
+            h, new = self.rest(ready.sand, ready.rate, self.sweeps, ready.height, ready.guess)
             if gone is not None and lost is not None:
-                gone = gone + lost + flux[-1]
-            return (h, self.kept(ready.part, flux, state[1]), ready.stand()), gone
+                gone = gone + lost + new[-1]
+            return (h, self.kept(ready.part, new, flux), ready.stand()), gone, scooped
 
         state = (old, flux, self.block.clear(view))
-        (new, after, _), gone = lax.fori_loop(0, self.chunk, substep, (state, gone))
+        (new, after, _), gone, scooped = lax.fori_loop(0, self.chunk, substep, (state, gone, sand.scooped))
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
         lost = self.block.lose(way, view, sand.lost, gone)
-        out = Moving(self.block.back(way, view, sand.height, new), lost, after, edge)
-        if self.block.drains or way.drop.ndim == sand.height.ndim:
+        out = Moving(self.block.back(way, view, sand.height, new), lost, after, edge, scooped)
+        if self.block.drains or way.drop.ndim == sand.height.ndim or way.room is not None:
             return out, sand
         return out, (jnp.where(at(view.holds) > 0, old, jnp.nan), flux)
 
@@ -186,6 +191,8 @@ class Advance(Step):
         """What a blade whose bottom rises or sinks takes up, and its bottom over each cell afterwards (quanta)."""
         assert way.rise is not None
         old, new = (self.floor(way, reach, by) for by in (begin, begin + ahead))
+        if way.room is not None:
+            return blade.cleared(reach, near, new), new
         return blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near)), new
 
     def displaced(
@@ -205,10 +212,13 @@ class Advance(Step):
     def floor(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
         """The blade's bottom over each cell near it (quanta), when it has moved by a length (spacings).
 
-        Under a bottom that rises, each cell's floor is where the blade's front left it.
+        Under a bottom that rises, each cell's floor is where the blade's front left it. A bucket's edge is thin: it leaves
+        each cell at the height of the path there.
         """
         assert way.rise is not None
         behind = blade.behind_the_front(reach, spread(way.half, inner(reach.along)))
+        if way.room is not None:
+            return (way.bottom + (by + way.half - behind) * way.rise) / way.quantum
         past = jnp.where(way.rise > 0, jnp.minimum(behind, by), 0)
         return (way.bottom + (by - past) * way.rise) / way.quantum
 

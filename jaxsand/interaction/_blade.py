@@ -18,9 +18,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.interaction._displacement import EIGHT, shares
-from jaxsand.interaction.stencil import both_ends, inner, outer, seen
+from jaxsand.interaction.stencil import both_ends, inner, outer, seen, spread, total
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.relaxation.ghost_cells import at, truncate
+from jaxsand.relaxation.ghost_cells import Lost, at, counted, truncate
 from jaxsand.scene.grid import Neighbours
 
 _LEAST = 1e-4
@@ -122,6 +122,20 @@ def cleared_beneath(reach: Reach, h: jax.Array, old: jax.Array, new: jax.Array, 
     """
     beneath = truncate(inner(reach.before) * jnp.maximum(jnp.minimum(h, old) - new, 0))
     return beneath + cleared(reach, h - beneath, new, jnp.clip(-rise / _SINKS, 0, 1))
+
+
+def scooped(room: jax.Array | None, account: Lost, taken: jax.Array) -> tuple[jax.Array | float, Lost]:
+    """What of the sand that is taken up goes into a bucket (quanta), and the bucket's account afterwards.
+
+    `room` is what it could take up at first (quanta), None where there is no bucket. When it becomes full, it takes the same
+    share from every cell.
+    """
+    if room is None or account is None:
+        return 0.0, account
+    wanted, left = total(taken), jnp.maximum(room - (account[0] + account[1]), 0)
+    share = jnp.where(wanted > left, left / jnp.where(wanted > 0, wanted, 1), 1)
+    into = truncate(taken * spread(share, taken))
+    return into, counted(account, into)
 
 
 def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.Array, Fluxes]:

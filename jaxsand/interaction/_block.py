@@ -38,7 +38,7 @@ class Way:
         level: height of a draining rim, or None.
         rate: rate of the proximal steps.
         angle: angle by which the blade turns in place before the leg (rad).
-        room: what the tool's bucket holds when full (quanta), or None if it has none.
+        room: sum of heights that the tool's bucket can take up from the path's start on (quanta), or None if it has none.
     """
 
     start: Pose

@@ -34,6 +34,7 @@ class Job:
         bottom: height of the tool's lowest point at the start of a leg (m).
         rise: slope at which that rises along the leg, a tangent, or None if it stays at one height.
         flow: rate and quantum of sweeps.
+        room: sum of heights (m) that the tool's bucket can still take up, or None if it has none.
     """
 
     bed: Bed
@@ -43,6 +44,7 @@ class Job:
     bottom: Float[Array, ""]
     rise: Float[Array, ""] | None
     flow: Flow
+    room: Float[Array, ""] | None = None
 
 
 def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -140,6 +140,7 @@ def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.
         job.flow.rate,
         angle,
         None if job.rise is None else job.rise * dx,
+        None if job.room is None else job.room / job.flow.quantum,
     )
 
 

@@ -44,12 +44,13 @@ class Lower(Step):
         over = self.block.over(way, view, old)
         gone = None if over is None else jnp.zeros_like(old)
         params = (shares, holds, cover, over)
-        state = (old - taken, gone, taken)
+        into, scooped = blade.scooped(way.room, sand.scooped, taken)
+        state = (old - taken, gone, taken - into)
         (new, gone, carried), _ = repeat_until(_at_rest, Plain(_spread, 16), 2 * self.block.near, params, state)
         new = self.block.put(whole, new + carried)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, whole, new, cover))
         lost = self.block.lose(way, view, sand.lost, None if gone is None else self.block.put(jnp.zeros_like(whole), gone))
-        return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge)
+        return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge, scooped)
 
 
 def _spread(params: Params, k: jax.Array, state: Carried) -> Carried:

@@ -93,15 +93,36 @@ def along_legs(
     *,
     rises: bool = False,
 ) -> tuple[Pushed, Tree]:
+    """Lowers the tool at path[0], moves it along the legs of `path` (m) and lifts it; see `travelled`.
+
+    Returns the map after the path, and what `record(height)` returned after each leg, stacked.
+    """
+    pushed, frames, _ = travelled(scene, height, path, rate, leg, record, rises=rises)
+    return pushed, frames
+
+
+def travelled(
+    scene: Scene,
+    height: jax.Array,
+    path: jax.Array,
+    rate: jax.Array | float,
+    leg: Leg,
+    record: Record | None = None,
+    *,
+    rises: bool = False,
+    room: jax.Array | None = None,
+) -> tuple[Pushed, Tree, Lost]:
     """Lowers the tool at path[0], moves it along the legs of `path` (m) and lifts it.
 
     `leg(job, pose, length, before, state)` moves the tool from `pose` by `length` (m). `before` is the tool's pose at the
     end of the last leg, or None if the tool is yet to be lowered. Without a tool the map stays as it is.
 
     The path is [n, 2], at the tool's own depth, or [n, 3] with heights of the tool's lowest point, if `rises` says that the
-    leg heeds `job.rise`. A leg straight up or down leaves the map as it is, and the outcome says NOT_FINITE.
+    leg heeds `job.rise`. A leg straight up or down leaves the map as it is, and the outcome says NOT_FINITE. A bucket can
+    take up a sum of heights of `room` (m).
 
-    Returns the map after the path, and what `record(height)` returned after each leg, stacked.
+    Returns the map after the path, what `record(height)` returned after each leg, stacked, and the sum of heights (m) that a
+    bucket took up, as an account (low, high).
     """
     if path.shape[1] == 3 and not rises:
         raise ValueError(
@@ -113,11 +134,8 @@ def along_legs(
     path = jnp.where(usable, path, 0)
     path, heights = path[:, :2], path[:, 2:]
     if isinstance(scene.tool, NoTool):
-        still = Pose(path[-1, 0], path[-1, 1], jnp.ones_like(path[0, 0]), jnp.zeros_like(path[0, 0]))
-        legs = path.shape[0] - 1
-        frames = jax.tree.map(lambda f: jnp.broadcast_to(f, (legs, *f.shape)), record(height)) if record else ()
-        return Pushed(height, _outcome(jnp.zeros((), bool), ~usable), jnp.zeros_like(path[0, 0]), still), frames
-    if not isinstance(scene.tool, Blade | Wheel):
+        return *_untouched(height, path, usable, record), None
+    if not isinstance(scene.tool, Blade | Wheel):  # a bucket's edge moves as a blade
         raise TypeError(f"scene.tool: got {type(scene.tool).__name__}; legs are of a Blade or a Wheel")
     bed = prepare(scene)
     intact, broken = mark(scene, height)
@@ -126,12 +144,15 @@ def along_legs(
     deep = extent(scene.tool, heights)
     scale = 4 * (jnp.maximum(largest(intact), bed.elsewhere) + jnp.where(usable, deep, 0))
     flow = Flow(jnp.asarray(rate), quantum(scale))
-    job = Job(bed, *centres(scene.grid, height.dtype), tool, jnp.where(usable, lowest(scene.tool), jnp.inf), None, flow)
+    job = Job(
+        bed, *centres(scene.grid, height.dtype), tool, jnp.where(usable, lowest(scene.tool), jnp.inf), None, flow, room
+    )
     lost = nothing_lost(bed, height)
     moved = jnp.zeros_like(job.bottom)
     if isinstance(scene.window, Window):
         moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
-    state = State(intact, lost, moved, (), None)
+    zero = jnp.zeros_like(job.bottom)
+    state = State(intact, lost, moved, (), None if room is None else (zero, zero))
 
     def at_height(start: jax.Array, stop: jax.Array, length: jax.Array) -> Job:
         if not start.size:
@@ -139,13 +160,13 @@ def along_legs(
         rise = (stop[0] - start[0]) / jnp.where(length > 0, length, 1)
         return replace(job, bottom=jnp.where(usable, start[0], jnp.inf), rise=rise)
 
-    pose, length = _heading(path[0], path[1], None)
+    pose, length = heading(path[0], path[1], None)
     state = leg(at_height(heights[0], heights[1], length), pose, length, None, state)
     frames = [record(unmark(state.height, height))] if record else []
 
     def later_leg(carry: tuple[Pose, State], points: tuple[jax.Array, ...]) -> tuple[tuple[Pose, State], Tree]:
         before, state = carry
-        pose, length = _heading(points[0], points[1], before)
+        pose, length = heading(points[0], points[1], before)
         job = at_height(points[2], points[3], length)
         state = leg(job, pose, length, Pose(pose.x, pose.y, before.cos, before.sin), state)
         return (pose, state), record(unmark(state.height, height)) if record else ()
@@ -163,7 +184,16 @@ def along_legs(
     drained = volume_lost(bed, lost)
     end = Pose(path[-1, 0], path[-1, 1], pose.cos, pose.sin)
     broken = broken | spoiled(intact, marked) | ~sound(bed) | ~usable
-    return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames
+    scooped = jax.tree.map(lambda count: count * flow.quantum, state.scooped)
+    return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames, scooped
+
+
+def _untouched(height: jax.Array, path: jax.Array, usable: jax.Array, record: Record | None) -> tuple[Pushed, Tree]:
+    """What `along_legs` returns where there is no tool."""
+    still = Pose(path[-1, 0], path[-1, 1], jnp.ones_like(path[0, 0]), jnp.zeros_like(path[0, 0]))
+    legs = path.shape[0] - 1
+    frames = jax.tree.map(lambda f: jnp.broadcast_to(f, (legs, *f.shape)), record(height)) if record else ()
+    return Pushed(height, _outcome(jnp.zeros((), bool), ~usable), jnp.zeros_like(path[0, 0]), still), frames
 
 
 def upright(path: jax.Array) -> jax.Array:
@@ -203,7 +233,7 @@ def _outcome(window_edge: jax.Array, not_finite: jax.Array) -> jax.Array:
     return said(Outcome.WINDOW_EDGE, window_edge) | said(Outcome.NOT_FINITE, not_finite)
 
 
-def _heading(start: jax.Array, stop: jax.Array, before: Pose | None) -> tuple[Pose, jax.Array]:
+def heading(start: jax.Array, stop: jax.Array, before: Pose | None) -> tuple[Pose, jax.Array]:
     """The pose at the start of a leg, and the leg's length (m). A leg of no length keeps the heading; the first faces +x."""
     run = stop - start
     size = lax.stop_gradient(jnp.max(jnp.abs(run)))  # squares of far strokes would overflow

@@ -57,7 +57,8 @@ class Turn(Step):
         gone = None if lost is None else lost + flux[-1]
         flux = self.kept(part, flux, sand.flux)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))
-        return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
+        account = self.block.lose(way, view, sand.lost, gone)
+        return Moving(self.block.back(way, view, sand.height, new), account, flux, edge, sand.scooped)
 
 
 def rotated(pose: Pose, angle: jax.Array) -> Pose:

@@ -31,7 +31,7 @@ from jaxsand.interaction._block import SPARE, Block, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._leg import Steps, chunk, moved, way_of
 from jaxsand.interaction._lowering import Lower
-from jaxsand.interaction._path import Pushed, Record, State, along_legs
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, travelled
 from jaxsand.interaction._turning import Turn
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.scene.scene import Scene
@@ -60,6 +60,34 @@ def push_along(
 
     leg = partial(_leg, scene, push, rest, path.shape[0] > 2)
     return along_legs(scene, height, path, push.rate, leg, record, rises=True)
+
+
+def scoop_along(
+    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 3"], push: "SteppedPush", room: Float[Array, ""]
+) -> tuple[Pushed, tuple[jax.Array, jax.Array]]:
+    """Moves a bucket's edge along `path` (m); what it cuts goes into the bucket, up to a sum of heights of `room` (m).
+
+    The scene's tool is a blade as wide as the edge, a cell thick at most. It is moved such that its rear starts at path[0]
+    and its front ends at path[-1], so that what it cuts lies between the path's ends.
+
+    Returns the map, and the account (low, high) of the sum of heights (m) in the bucket.
+    """
+    first, last = path[1] - path[0], path[-1] - path[-2]
+    lengths = jnp.stack([_length(first[:2]), _length(last[:2])])
+    thick = jnp.minimum(jnp.min(lengths), scene.grid.spacing)
+    parts = thick / 2 / jnp.where(lengths > 0, lengths, 1)
+    path = path.at[0].add(parts[0] * first).at[-1].add(-parts[1] * last)
+    scene = replace(scene, tool=replace(scene.tool, thickness=thick))
+    leg = partial(_leg, scene, push, bring_to_rest, path.shape[0] > 2)
+    pushed, _, scooped = travelled(scene, height, path, push.rate, leg, rises=True, room=room)
+    assert scooped is not None
+    return pushed, scooped
+
+
+def _length(run: jax.Array) -> jax.Array:
+    """The length of a vector, with a derivative at 0."""
+    square = jnp.sum(run**2)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def _leg(

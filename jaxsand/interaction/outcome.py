@@ -31,6 +31,9 @@ _ADVICE = {
         "the map, the stroke or the scene holds a NaN or an infinity, heights overflowed, or a leg leads straight up or "
         "down: look with numpy.isfinite, and give every leg with heights a length"
     ),
+    Outcome.NOT_POURED: (
+        "less sand was poured than asked for: ask for at most load_volume(scene, load), and pour onto cells with sand"
+    ),
 }
 
 

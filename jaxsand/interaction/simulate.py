@@ -26,7 +26,7 @@ from jaxsand.scene.tools import Pose
 from jaxsand.scene.window import Whole, Window
 
 Rules = tuple[PushRule, Scheme, Stop]
-Result = TypeVar("Result", Pushed, "Shaped", tuple["Shaped", jax.Array])
+Result = TypeVar("Result", bound="Pushed | Shaped | tuple[Shaped, jax.Array]")
 STROKES = (4, 6)  # numbers of a stroke: x, y of its start and end, or x, y, z
 Stroke = Float[ArrayLike, "4"] | Float[ArrayLike, "6"]
 Strokes = Float[ArrayLike, "n 4"] | Float[ArrayLike, "n 6"]
@@ -89,7 +89,7 @@ def act(scene: Scene, height: Float[ArrayLike, "H W"], stroke: Stroke, *, push: 
     """
     scene, height, rules = ready(scene, height, push, None, None)
     path = _stroke(stroke, height.dtype)
-    return _as_needed(lambda scene, _: _act(scene, height, path, rules), scene, rules, (height, path))
+    return as_needed(lambda scene, _: _act(scene, height, path, rules), scene, rules, (height, path))
 
 
 def step(
@@ -190,7 +190,7 @@ def follow(
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
-    return _as_needed(partial(_followed, height, path, rules), scene, rules, (height, path))
+    return as_needed(partial(_followed, height, path, rules), scene, rules, (height, path))
 
 
 def follow_frames(
@@ -230,7 +230,7 @@ def follow_frames(
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = _path(path, height.dtype)
-    return _as_needed(lambda scene, _: _follow(scene, height, path, rules, record=_itself), scene, rules, (height, path))
+    return as_needed(lambda scene, _: _follow(scene, height, path, rules, record=_itself), scene, rules, (height, path))
 
 
 def rollout(
@@ -275,13 +275,15 @@ def rollout(
     if strokes.ndim != 2 or strokes.shape[1] not in STROKES:
         remedy = "give a row x0, y0, x1, y1 [n, 4] or x0, y0, z0, x1, y1, z1 [n, 6] for each push"
         raise ValueError(f"strokes: got shape {list(strokes.shape)}; {remedy}")
-    return _as_needed(lambda scene, _: _rollout(scene, height, strokes, rules), scene, rules, (height, strokes))
+    return as_needed(lambda scene, _: _rollout(scene, height, strokes, rules), scene, rules, (height, strokes))
 
 
-def _as_needed(
-    run: Callable[[Scene, Whole | Window], Result], scene: Scene, rules: Rules, arrays: tuple[jax.Array, jax.Array]
+def as_needed(
+    run: Callable[[Scene, Whole | Window], Result], scene: Scene, rules: Rules, arrays: tuple[Tree, ...]
 ) -> Result:
     """The result of `run(scene, settling window)` in the smallest window whose edge the sand does not reach.
+
+    `arrays` is all that `run` depends on besides, the path or strokes second.
 
     While values are traced there is one try, in a window that is wide enough for most strokes.
     """

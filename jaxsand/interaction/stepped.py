@@ -11,7 +11,7 @@ from jaxsand.interaction.blade_stepped import push_along
 from jaxsand.interaction.wheel_stepped import roll_along
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade, NoTool, Wheel
+from jaxsand.scene.tools import Blade, Bucket, NoTool, Wheel
 
 
 @jax.tree_util.register_dataclass
@@ -54,7 +54,7 @@ class SteppedPush:
         if not isinstance(scene.tool, NoTool | Blade | Wheel):
             raise ValueError(
                 f"push: got SteppedPush for a {type(scene.tool).__name__}; SteppedPush() is for a Blade or a Wheel, "
-                "give a PushRule that moves this tool"
+                + ("call js.scoop and js.dump" if isinstance(scene.tool, Bucket) else "give a PushRule that moves this tool")
             )
         if not 0 < self.substep <= 1:
             raise ValueError(f"push.substep: got {self.substep!r}; give a part of a spacing, above 0 and at most 1")

@@ -19,6 +19,7 @@ from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import Scene
 
 Lost = tuple[jax.Array, jax.Array] | None
+_COARSE = 4096.0  # quanta that an account keeps in its coarse part
 
 
 @jax.tree_util.register_dataclass
@@ -139,9 +140,25 @@ def lose(quantum: jax.Array, lost: tuple[jax.Array, jax.Array], amount: jax.Arra
     """
     low, high = lost
     low = low + amount
-    coarse = quantum * 4096
+    coarse = quantum * _COARSE
     carry = truncate(low / coarse) * coarse
     return low - carry, high + carry
+
+
+def counted(account: tuple[jax.Array, jax.Array], amount: Float[Array, "m n ..."]) -> tuple[jax.Array, jax.Array]:
+    """Adds the sum of a map of whole quanta to an account (low, high), a pair of numbers of quanta whose sum is exact.
+
+    The cells are summed as whole numbers, coarse and fine parts apart. The derivative is that of the sum of floats.
+    """
+    low, high = account
+    whole = jnp.int64 if amount.dtype == jnp.float64 else jnp.int32
+    total = jnp.sum(amount, axis=(0, 1))
+    exact = lax.stop_gradient(amount)
+    parts = jnp.trunc(exact / _COARSE)
+    coarse, fine = (jnp.sum(x.astype(whole), axis=(0, 1)).astype(amount.dtype) for x in (parts, exact - _COARSE * parts))
+    low = low + fine + (total - lax.stop_gradient(total))
+    carry = lax.stop_gradient(jnp.trunc(low / _COARSE))
+    return low - _COARSE * carry, high + _COARSE * (coarse + carry)
 
 
 def nothing_lost(bed: Bed, height: jax.Array) -> Lost:

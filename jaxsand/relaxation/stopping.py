@@ -26,6 +26,7 @@ class Outcome(IntFlag):
         NOT_FINITE: the map, the stroke or the scene holds a NaN or an infinity, heights overflowed, or the stroke lies
             farther away than floats resolve or leads straight up or down. A bad cell of the map was treated as solid and is
             returned as it was.
+        NOT_POURED: less sand was poured than asked for: the bucket held less, or no cell with sand lies where it was poured.
 
     Example:
         >>> import jaxsand as js
@@ -38,6 +39,7 @@ class Outcome(IntFlag):
     NOT_STILL = 1
     WINDOW_EDGE = 2
     NOT_FINITE = 4
+    NOT_POURED = 8
 
 
 def said(outcome: Outcome, yes: Bool[Array, "..."]) -> Int[Array, "..."]:

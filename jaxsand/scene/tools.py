@@ -91,6 +91,44 @@ class Blade:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Bucket:
+    """A bucket that scoops sand with its front edge, carries it, and dumps it.
+
+    `scoop` moves the edge along a path: what it cuts goes into the bucket until that is full, and the rest is pushed ahead,
+    as by a blade. `dump` pours it out, across the bucket's width. What it holds is one number; see `Load`.
+
+    Attributes:
+        width: extent of the edge across the direction of travel (m), at least one cell.
+        length: extent along the direction of travel (m), at least one cell. What the bucket holds is one number, so its
+            length moves no sand.
+        capacity: volume that it holds when full (m^3), above 0.
+        depth: depth of the edge below height 0 (m) on paths without heights.
+
+    Example:
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Bucket(width=0.03, length=0.02, capacity=6e-6))
+        >>> scene.tool.capacity
+        6e-06
+    """
+
+    width: Number
+    length: Number
+    capacity: Number
+    depth: Number = 0.0075
+
+    def check(self, grid: Grid) -> None:
+        """Raises ValueError if a length is out of range, or less than a cell, or it holds nothing; see `Tool`."""
+        positive("tool.width", self.width, "give the bucket's width in metres")
+        positive("tool.length", self.length, "give the bucket's length in metres")
+        positive("tool.capacity", self.capacity, "give what the bucket holds in m^3")
+        finite("tool.depth", self.depth, "give the depth of the bucket's edge below height 0 in metres")
+        sizes = {"width": self.width, "length": self.length}
+        _at_least_a_cell("bucket", sizes, grid)
+        _within_the_map(sizes, grid)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Smooth:
     """A wheel whose rim carries no sand to behind it: it has no grousers, or does not turn. The default of `Wheel`.
 

@@ -1,0 +1,265 @@
+"""A bucket: it scoops sand along a path, carries it, and dumps it along another.
+
+A bucket's edge cuts as a blade a cell thick at most (blade_stepped.py). What it cuts goes into the bucket until that is
+full; the rest moves ahead. Sand in the bed and in the bucket together keep their volume as well as floats allow: what is
+taken up is counted in whole quanta, and a load is a pair of floats.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxsand.interaction._path import heading
+from jaxsand.interaction.blade_stepped import scoop_along
+from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured
+from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, lifted, ready
+from jaxsand.interaction.stepped import SteppedPush
+from jaxsand.relaxation.schemes import Scheme
+from jaxsand.relaxation.settling import relax
+from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
+from jaxsand.scene.masked import POINTS
+from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
+from jaxsand.scene.tools import Blade, Bucket, Pose
+from jaxsand.scene.window import Whole, Window
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Load:
+    """What a bucket holds: the volume is (high + low) dx^2, as `load_volume` says in m^3.
+
+    Two floats hold it, so that no sand is lost to rounding, however often the bucket is filled and emptied.
+
+    Attributes:
+        high: sum of heights of cells (m), as one float has it.
+        low: what that leaves out (m).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((16, 16), 0.01, tool=js.Bucket(width=0.04, length=0.03, capacity=2e-5))
+        >>> scooped = js.scoop(scene, jnp.zeros((16, 16)), jnp.array([[0.04, 0.08, -0.01], [0.08, 0.08, -0.01]]))
+        >>> print(f"{js.load_volume(scene, scooped.load):.2e}")
+        1.60e-05
+    """
+
+    high: Float[Array, "*batch"]
+    low: Float[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Loaded(Shaped):
+    """A map after a bucket has scooped or dumped and the sand has settled: the fields of `Shaped`, and the load.
+
+    Attributes:
+        load: what the bucket holds afterwards; see `Load`.
+    """
+
+    load: Load
+
+
+def scoop(
+    scene: Scene,
+    height: Float[ArrayLike, "H W"],
+    path: Path,
+    load: Load | None = None,
+    *,
+    push: SteppedPush | None = None,
+    scheme: Scheme | None = None,
+    stop: Stop | None = None,
+) -> Loaded:
+    """Moves a bucket's edge along a path; what it cuts goes into the bucket. Then the sand settles.
+
+    The edge cuts the sand between the path's two ends, as wide as the bucket and down to the path's height, so that a cut of
+    depth d and length l holds w l d. When the bucket is full, the rest is pushed ahead, as by a blade, and the outcome stays
+    0. At a corner the edge turns in place, and pushes what it sweeps. Differentiable like `follow`, in the height, the path,
+    the load and the bucket, but where the bucket just becomes full.
+
+    Args:
+        scene: the scene, with a `Bucket` as its tool.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        path: the points [n, 3] = x, y, z (m) that the middle of the edge visits, z linear along each leg, n >= 2; or [n, 2],
+            at the bucket's depth. The edge may begin or end in the air.
+        load: what the bucket holds before; None if it is empty.
+        push: `SteppedPush`: how finely the edge moves.
+        scheme: scheme of settling, as of `settle`.
+        stop: stop rule of settling, as of `settle`.
+
+    Returns:
+        The settled map, the outcome, the volume that drained, the edge's last pose, and the load.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range, or the scene's tool is no bucket.
+        NotImplementedError: a second derivative is asked for.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((16, 16), 0.01, tool=js.Bucket(width=0.04, length=0.03, capacity=2e-5))
+        >>> scooped = js.scoop(scene, jnp.zeros((16, 16)), jnp.array([[0.04, 0.08, 0.0], [0.08, 0.08, -0.01]]))
+        >>> print(f"{js.load_volume(scene, scooped.load):.2e} {js.volume(scene, scooped.height):.2e}")
+        8.00e-06 -8.00e-06
+    """
+    bucket = _bucket(scene)
+    if push is not None and not isinstance(push, SteppedPush):
+        raise ValueError(f"push: got {push!r}; a bucket scoops by SteppedPush(substep, sweeps)")
+    edge = replace(scene, tool=Blade(bucket.width, scene.grid.spacing, bucket.depth))
+    edge, height, rules = ready(edge, height, push, scheme, stop)
+    path = _path(path, height.dtype, 2)
+    if path.shape[1] == 2:
+        path = jnp.concatenate([path, jnp.full_like(path[:, :1], -jnp.asarray(bucket.depth, path.dtype))], 1)
+    held = _load(load, height.dtype)
+    capacity = jnp.asarray(bucket.capacity, height.dtype)
+    return as_needed(partial(_scooped, height, path, held, capacity, rules), edge, rules, (height, path, held))
+
+
+def dump(
+    scene: Scene,
+    height: Float[ArrayLike, "H W"],
+    path: Float[ArrayLike, "n 2"] | Float[ArrayLike, "n 3"],
+    load: Load | None,
+    *,
+    amount: Float[ArrayLike, ""] | None = None,
+    scheme: Scheme | None = None,
+    stop: Stop | None = None,
+) -> Loaded:
+    """Pours sand out of a bucket, and lets it settle.
+
+    On a path of one point all falls there, and makes a cone. On a longer one it is spread evenly along the way, as wide as
+    the bucket: a volume V over a way l is V / (w l) thick. What falls on solid cells or off the map falls on the rest of the
+    path instead. Differentiable in the height, the path, the load and the amount, but where the amount is just the load.
+
+    Args:
+        scene: the scene, with a `Bucket` as its tool.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        path: the points [n, 2] = x, y (m) over which the bucket is emptied, n >= 1; of [n, 3] the heights do not matter.
+        load: what the bucket holds; None if it is empty.
+        amount: how much to pour (m^3), 0 or more; None for all of it.
+        scheme: scheme of settling, as of `settle`.
+        stop: stop rule of settling, as of `settle`.
+
+    Returns:
+        The settled map, the outcome, the volume that drained, the bucket's last pose, and what it still holds. If the amount
+        is more than the load, the load is poured and the outcome says NOT_POURED; so it does if no cell with sand lies below
+        the path, and then nothing is poured.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range, or the scene's tool is no bucket.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((16, 16), 0.01, tool=js.Bucket(width=0.04, length=0.03, capacity=2e-5))
+        >>> scooped = js.scoop(scene, jnp.zeros((16, 16)), jnp.array([[0.02, 0.04, -0.01], [0.06, 0.04, -0.01]]))
+        >>> poured = js.dump(scene, scooped.height, jnp.array([[0.11, 0.11]]), scooped.load)
+        >>> print(f"{js.load_volume(scene, poured.load):.0e} {poured.height[10:12, 10:12].mean():.3f}")
+        0e+00 0.016
+    """
+    _bucket(scene)
+    if amount is not None:
+        check_amount("amount", amount, "give what to pour, or None for all of it")
+    scheme, stop = check_rule(scene, scheme, stop)
+    scene, height = fit(scene, height)
+    path = _path(path, height.dtype, 1)[:, :2]
+    held = _load(load, height.dtype)
+    pour = None if amount is None else as_array("amount", amount, height.dtype)
+    return _dumped(scene, height, path, held, pour, cast((scheme, stop), height.dtype))
+
+
+def load_volume(scene: Scene, load: Load | None) -> Float[Array, "*batch"]:
+    """The volume (m^3) that a bucket holds; 0 for None.
+
+    Example:
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Bucket(width=0.03, length=0.02, capacity=6e-6))
+        >>> float(js.load_volume(scene, None))
+        0.0
+    """
+    check_scene(scene)
+    dx = jnp.asarray(scene.grid.spacing)
+    held = _load(load, jnp.result_type(dx) if load is None else jnp.result_type(load.high))
+    return (held.high + held.low) * dx.astype(held.high.dtype) ** 2
+
+
+def _bucket(scene: Scene) -> Bucket:
+    check_scene(scene)
+    if not isinstance(scene.tool, Bucket):
+        raise ValueError(
+            f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Bucket(width, length, capacity))"
+        )
+    return scene.tool
+
+
+def _path(path: ArrayLike, dtype: jax.typing.DTypeLike, least: int) -> jax.Array:
+    path = as_array("path", path, dtype, POINTS)
+    if path.ndim != 2 or path.shape[0] < least or path.shape[1] not in (2, 3):
+        points = "two points" if least > 1 else "one point"
+        remedy = "use jax.vmap" if path.ndim > 2 else f"give at least {points} x, y [n, 2] or x, y, z [n, 3] in metres"
+        raise ValueError(f"path: got shape {list(path.shape)}; {remedy}")
+    return path
+
+
+def _load(load: Load | None, dtype: jax.typing.DTypeLike) -> Load:
+    if load is None:
+        return Load(jnp.zeros((), dtype), jnp.zeros((), dtype))
+    if not isinstance(load, Load):
+        raise ValueError(f"load: got {type(load).__name__}; give the .load of what scoop or dump returned, or None")
+    return Load(jnp.asarray(load.high, dtype), jnp.asarray(load.low, dtype))
+
+
+def _added(load: Load, account: tuple[jax.Array, jax.Array], sign: float) -> Load:
+    """The load with an account (low, high) added or taken away, without rounding beyond that of the second float."""
+    high, rest = _two_sum(load.high, sign * account[1])
+    low = load.low + sign * account[0] + rest
+    return Load(*_two_sum(high, low))
+
+
+def _two_sum(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """a + b as a float, and what rounding left of it (Knuth's two-sum)."""
+    whole = lax.optimization_barrier(a + b)
+    other = lax.optimization_barrier(whole - a)
+    return whole, lax.stop_gradient((a - lax.optimization_barrier(whole - other)) + (b - other))
+
+
+@jax.jit
+def _scooped(
+    height: jax.Array, path: jax.Array, load: Load, capacity: jax.Array, rules: Rules, scene: Scene, window: Whole | Window
+) -> Loaded:
+    push, scheme, stop = rules
+    assert isinstance(push, SteppedPush)
+    room = jnp.maximum(capacity / scene.grid.spacing**2 - (load.high + load.low), 0)
+    pushed, account = scoop_along(scene, height, path, push, room)
+    shaped = lifted(pushed, relax(scene, pushed.height, scheme, stop, window))
+    return Loaded(**vars(shaped), load=_added(load, account, 1))
+
+
+@jax.jit
+def _dumped(
+    scene: Scene,
+    height: jax.Array,
+    path: jax.Array,
+    load: Load,
+    amount: jax.Array | None,
+    rules: tuple[Scheme, Stop],
+) -> Loaded:
+    tool = scene.tool
+    assert isinstance(tool, Bucket)
+    there = load.high + load.low
+    asked = there if amount is None else amount / scene.grid.spacing**2
+    sound = jnp.all(jnp.isfinite(path)) & jnp.isfinite(asked) & (asked >= 0) & jnp.isfinite(there)
+    path = jnp.where(sound, path, 0)
+    asked, held = jnp.where(sound, asked, 0), jax.tree.map(lambda x: jnp.where(sound, x, 0), load)
+    weights = point_weights(scene, path[0]) if path.shape[0] == 1 else path_weights(scene, path, jnp.asarray(tool.width))
+    after, account, missed = poured(scene, height, weights, asked, (held.low, held.high))
+    settled = relax(scene, after, *rules)
+    outcome = settled.outcome | missed | said(Outcome.NOT_FINITE, ~sound)
+    way, _ = heading(path[-2 if path.shape[0] > 1 else 0], path[-1], None)
+    pose = Pose(path[-1, 0], path[-1, 1], way.cos, way.sin)
+    fields = {**vars(settled), "outcome": outcome}
+    return Loaded(**fields, pose=pose, load=jax.tree.map(partial(jnp.where, sound), _added(held, account, -1), load))

@@ -1,0 +1,188 @@
+"""Sand that is put down or taken away: from a bucket, at a point, or over a footprint."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxsand.interaction._path import heading
+from jaxsand.relaxation.ghost_cells import counted, largest, mark, prepare, quantum, truncate, unmark
+from jaxsand.relaxation.schemes import Scheme
+from jaxsand.relaxation.settling import Settled, relax
+from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
+from jaxsand.scene.grid import centres
+from jaxsand.scene.masked import POINTS
+from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
+from jaxsand.scene.tools import interval, local
+from jaxsand.scene.validation import concrete, short
+
+Account = tuple[jax.Array, jax.Array]
+
+
+def deposit(
+    scene: Scene,
+    height: Float[ArrayLike, "H W"],
+    where: Float[ArrayLike, "2"] | Float[ArrayLike, "H W"],
+    volume: Float[ArrayLike, ""],
+    *,
+    scheme: Scheme | None = None,
+    stop: Stop | None = None,
+) -> Settled:
+    """Puts sand down and lets it settle: rain on a point, or a truck's heap.
+
+    A volume V raises cell [i, j] by V w[i, j] / (dx^2 sum w), where the weights w are the footprint's, or, for a point, the
+    bilinear ones of the four cells around it. Cells that are solid or off the map get none. Differentiable once, in the
+    height, in the point or the footprint, and in the volume.
+
+    Args:
+        scene: the scene; its tool does not matter.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        where: a point [2] = x, y (m), or a footprint: weights [H, W] of 0 or more, such as the share of each cell.
+        volume: how much sand (m^3), 0 or more.
+        scheme: scheme of settling, as of `settle`.
+        stop: stop rule of settling, as of `settle`.
+
+    Returns:
+        The settled map, and how settling went. The outcome says NOT_POURED where all weights are 0, and the map is then as
+        if no sand had come.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range.
+
+    Example:
+        A heap of sand at a point becomes a cone.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((16, 16), 0.01)
+        >>> heap = js.deposit(scene, jnp.zeros((16, 16)), jnp.array([0.08, 0.08]), 1e-5)
+        >>> print(f"{js.volume(scene, heap.height):.2e} {heap.height.max():.3f}")
+        1.00e-05 0.014
+    """
+    return _changed("deposit", scene, height, where, volume, scheme, stop, 1.0)
+
+
+def remove(
+    scene: Scene,
+    height: Float[ArrayLike, "H W"],
+    where: Float[ArrayLike, "2"] | Float[ArrayLike, "H W"],
+    volume: Float[ArrayLike, ""],
+    *,
+    scheme: Scheme | None = None,
+    stop: Stop | None = None,
+) -> Settled:
+    """Takes sand away and lets the rest settle: the opposite of `deposit`, with the same arguments.
+
+    A volume V lowers cell [i, j] by V w[i, j] / (dx^2 sum w).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((16, 16), 0.01)
+        >>> pit = js.remove(scene, jnp.zeros((16, 16)), jnp.array([0.08, 0.08]), 1e-5)
+        >>> print(f"{js.volume(scene, pit.height):.2e} {pit.height.min():.3f}")
+        -1.00e-05 -0.014
+    """
+    return _changed("remove", scene, height, where, volume, scheme, stop, -1.0)
+
+
+def _changed(
+    name: str,
+    scene: Scene,
+    height: ArrayLike,
+    where: ArrayLike,
+    volume: ArrayLike,
+    scheme: Scheme | None,
+    stop: Stop | None,
+    sign: float,
+) -> Settled:
+    check_scene(scene)
+    scheme, stop = check_rule(scene, scheme, stop)
+    scene, height = fit(scene, height)
+    where = as_array("where", where, height.dtype, POINTS)
+    if where.shape not in ((2,), height.shape):
+        raise ValueError(
+            f"where: got shape {list(where.shape)}; give a point [2] = x, y (m), or weights of shape {list(height.shape)}"
+        )
+    known = concrete(where)
+    if known is not None and ((where.ndim > 1 and not np.all(known >= 0)) or not np.all(np.isfinite(known))):
+        raise ValueError(
+            "where: got a number that is not finite, or a weight below 0; give x and y, or weights of 0 or more"
+        )
+    check_amount("volume", volume, f"give what to {name}, 0 or more")
+    volume = as_array("volume", volume, height.dtype)
+    return _settled(scene, height, where, volume, cast((scheme, stop), height.dtype), sign)
+
+
+def check_amount(name: str, value: object, remedy: str) -> None:
+    """Raises ValueError unless it is one finite number of m^3, 0 or more; what is being traced passes."""
+    array = concrete(value)
+    if array is not None and not (array.ndim == 0 and np.isfinite(array) and array >= 0):
+        raise ValueError(f"{name}: got {short(value)}; it must be one finite number of m^3: {remedy}")
+
+
+@jax.jit
+def _settled(
+    scene: Scene, height: jax.Array, where: jax.Array, volume: jax.Array, rules: tuple[Scheme, Stop], sign: jax.Array
+) -> Settled:
+    if where.ndim == 1:
+        where = point_weights(scene, where)
+    amount = volume / scene.grid.spacing**2
+    changed, _, missed = poured(scene, height, where, amount, (jnp.zeros_like(amount), amount), sign)
+    settled = relax(scene, changed, *rules)
+    return replace(settled, outcome=settled.outcome | missed)
+
+
+def poured(
+    scene: Scene, height: jax.Array, weights: jax.Array, amount: jax.Array, held: Account, sign: jax.Array | float = 1.0
+) -> tuple[jax.Array, Account, jax.Array]:
+    """The map after a sum of heights `amount` (m) was put down (or, of sign -1, taken away) in proportion to weights [H, W].
+
+    All of `held` (low, high), and no more, is put down if `amount` is as much or more.
+
+    Returns the map, the sum of heights that was put down as an account (m), and NOT_POURED if it was less than `amount`.
+    """
+    bed = prepare(scene)
+    marked, _ = mark(scene, height)
+    weights = jnp.where(jnp.isnan(marked), 0, jnp.maximum(weights, 0))
+    whole = jnp.sum(weights)
+    asked = jnp.maximum(amount, 0)
+    there = held[0] + held[1]
+    given = jnp.where(whole > 0, jnp.minimum(asked, there), 0)
+    share = weights / jnp.where(whole > 0, whole, 1)
+    size = quantum(jnp.maximum(largest(marked), bed.elsewhere) + jnp.max(share) * given)
+    put = truncate(share * given / size)
+    zero = jnp.zeros_like(given)
+    low, high = counted((zero, zero), put)
+    # What rounding left over goes to the cell with the largest share: of all that is held to the last quantum.
+    all_of_it = asked >= there
+    rest = jnp.where(all_of_it, (held[1] / size - high) + (held[0] / size - low), given / size - (low + high))
+    rest = jnp.where(whole > 0, jnp.floor(jax.lax.stop_gradient(rest)), 0)
+    cell = jnp.argmax(share.ravel())
+    put = put.ravel().at[cell].add(rest).reshape(put.shape)
+    low = low + rest
+    missed = said(Outcome.NOT_POURED, (asked > there * (1 + 1e-6)) | ((whole <= 0) & (asked > 0)))
+    return unmark(marked + sign * (put * size), height), (low * size, high * size), missed
+
+
+def point_weights(scene: Scene, point: Float[Array, "2"]) -> Float[Array, "H W"]:
+    """The bilinear weights of the cells around a point x, y (m)."""
+    x, y = centres(scene.grid, point.dtype)
+    dx = scene.grid.spacing
+    return jnp.maximum(1 - jnp.abs(x - point[0]) / dx, 0) * jnp.maximum(1 - jnp.abs(y - point[1]) / dx, 0)
+
+
+def path_weights(scene: Scene, path: Float[Array, "n 2"], width: Float[Array, ""]) -> Float[Array, "H W"]:
+    """The shares of cells over which a line of a width (m) passes on its way along a path (m), summed over the legs."""
+    x, y = centres(scene.grid, path.dtype)
+    dx = jnp.asarray(scene.grid.spacing)
+
+    def of_leg(start: jax.Array, stop: jax.Array) -> jax.Array:
+        pose, length = heading(start, stop, None)
+        along, across = local(pose, x, y)
+        return interval(along, jnp.zeros_like(length), length, dx) * interval(across, -width / 2, width / 2, dx)
+
+    return jnp.sum(jax.vmap(of_leg)(path[:-1], path[1:]), axis=0)
