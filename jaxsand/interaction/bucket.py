@@ -58,7 +58,21 @@ class Loaded(Shaped):
     """A map after a bucket has scooped or dumped and the sand has settled: the fields of `Shaped`, and the load.
 
     Attributes:
-        load: what the bucket holds afterwards; see `Load`.
+        height: height map [H, W] (m).
+        sweeps: number of sweeps of settling.
+        residual: largest slope in excess of repose that is left, a tangent. It carries no derivative.
+        outcome: bits of `Outcome`, of the bucket's work and of settling; 0 when all went well. See `check`.
+        drained: volume that ran off over a draining edge (m^3).
+        pose: where the bucket was last, and its heading.
+        load: what it holds afterwards; see `Load`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> scene = js.make_scene((16, 16), 0.01, tool=js.Bucket(width=0.04, length=0.03, capacity=2e-5))
+        >>> scooped = js.scoop(scene, jnp.zeros((16, 16)), jnp.array([[0.04, 0.08, -0.01], [0.08, 0.08, -0.01]]))
+        >>> int(scooped.outcome), f"{scooped.pose.x:.3f}", f"{js.load_volume(scene, scooped.load):.1e}"
+        (0, '0.080', '1.6e-05')
     """
 
     load: Load
@@ -159,7 +173,7 @@ def dump(
         >>> scooped = js.scoop(scene, jnp.zeros((16, 16)), jnp.array([[0.02, 0.04, -0.01], [0.06, 0.04, -0.01]]))
         >>> poured = js.dump(scene, scooped.height, jnp.array([[0.11, 0.11]]), scooped.load)
         >>> print(f"{js.load_volume(scene, poured.load):.0e} {poured.height[10:12, 10:12].mean():.3f}")
-        0e+00 0.016
+        0e+00 0.013
     """
     _bucket(scene)
     if amount is not None:
@@ -235,7 +249,8 @@ def _scooped(
     assert isinstance(push, SteppedPush)
     room = jnp.maximum(capacity / scene.grid.spacing**2 - (load.high + load.low), 0)
     pushed, account = scoop_along(scene, height, path, push, room)
-    shaped = lifted(pushed, relax(scene, pushed.height, scheme, stop, window))
+    edge = replace(pushed, pose=replace(pushed.pose, x=path[-1, 0], y=path[-1, 1]))
+    shaped = lifted(edge, relax(scene, pushed.height, scheme, stop, window))
     return Loaded(**vars(shaped), load=_added(load, account, 1))
 
 

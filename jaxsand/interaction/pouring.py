@@ -60,7 +60,7 @@ def deposit(
         >>> scene = js.make_scene((16, 16), 0.01)
         >>> heap = js.deposit(scene, jnp.zeros((16, 16)), jnp.array([0.08, 0.08]), 1e-5)
         >>> print(f"{js.volume(scene, heap.height):.2e} {heap.height.max():.3f}")
-        1.00e-05 0.014
+        1.00e-05 0.011
     """
     return _changed("deposit", scene, height, where, volume, scheme, stop, 1.0)
 
@@ -84,7 +84,7 @@ def remove(
         >>> scene = js.make_scene((16, 16), 0.01)
         >>> pit = js.remove(scene, jnp.zeros((16, 16)), jnp.array([0.08, 0.08]), 1e-5)
         >>> print(f"{js.volume(scene, pit.height):.2e} {pit.height.min():.3f}")
-        -1.00e-05 -0.014
+        -1.00e-05 -0.011
     """
     return _changed("remove", scene, height, where, volume, scheme, stop, -1.0)
 
