@@ -15,7 +15,7 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way
+from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way, rotated
 from jaxsand.interaction._frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
 from jaxsand.interaction._resting_adjoint import Rested, blank, rest_pulled, rest_taped
 from jaxsand.interaction.resting import Links, Sand, bring_to_rest
@@ -151,12 +151,10 @@ class Advance(Step):
 
     def felt(self, way: Way, k: jax.Array, first: First, view: View, h: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The share of each cell that the blade covers at any time in step k, and the rate at which sand flows then."""
-        along, across = self.block.coordinates(frame_of(self.block.shape, way.start), first)
         gone = jnp.maximum(k - int(self.lowered), 0).astype(way.length.dtype)
         begin = jnp.minimum(gone * (self.chunk * self.substep), way.length)
         ahead = jnp.where(k >= int(self.lowered), jnp.minimum(way.length - begin, self.chunk * self.substep), 0)
-        beside = blade.share(across, -way.side, way.side)
-        cover = inner(blade.straight(along - begin, beside, way.half, ahead).swept)
+        cover = inner(self.reach(way, first, begin, ahead).swept)
         lowest = way if way.rise is None else way.at(jnp.where(way.rise < 0, begin + ahead, begin))
         return cover, way.rate * self.block.contact(lowest, view, cover, h)
 
@@ -169,21 +167,34 @@ class Advance(Step):
 
     def cut(self, way: Way, k: jax.Array, first: First, i: jax.Array, near: jax.Array) -> Cut:
         """What the blade cuts in sub-step i of step k from the heights `near` it."""
-        along, across = self.block.coordinates(frame_of(self.block.shape, way.start), first)
-        side = spread(way.side, across)
-        beside = lax.optimization_barrier(blade.share(across, -side, side))
         moving = k >= int(self.lowered)
         begin = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(way.length.dtype) * self.substep
         begin = jnp.minimum(begin, way.length)
         ahead = jnp.where(moving, jnp.minimum(way.length - begin, self.substep), 0)
-        half, further = spread(way.half, along), spread(ahead, along)
-        reach = blade.straight(along - spread(begin, along), beside, half, further)
+        reach = self.reach(way, first, begin, ahead)
         if way.rise is None:
             taken = blade.cleared(reach, near, spread(way.bottom / way.quantum, near))
         else:
             taken, floor = self.beneath(way, reach, near, begin, ahead)
             way = replace(way, bottom=floor * spread(way.quantum, near))
         return Cut(way, reach, moving, jnp.where(moving, ahead / self.substep, 1), jnp.where(ahead > 0, taken, 0))
+
+    def reach(self, way: Way, first: First, begin: jax.Array, ahead: jax.Array) -> blade.Reach:
+        """The blade's footprints as it moves ahead from `begin` (spacings)."""
+        frame = frame_of(self.block.shape, way.start)
+        if way.yaw is None:
+            along, across = self.block.coordinates(frame, first)
+            side, half = spread(way.side, across), spread(way.half, along)
+            beside = lax.optimization_barrier(blade.share(across, -side, side))
+            return blade.straight(along - spread(begin, along), beside, half, spread(ahead, along))
+        yaw = frame.mirrors(way.yaw)
+        frame = replace(frame, pose=rotated(frame.pose, yaw))
+        along, across = self.block.coordinates(frame, first)
+        further = spread(ahead, along)
+        cos, sin, half, side = (spread(x, along) for x in (jnp.cos(yaw), jnp.sin(yaw), way.half, way.side))
+        old = (along - spread(begin, along) * cos, across + spread(begin, along) * sin)
+        new = lax.optimization_barrier((old[0] - further * cos, old[1] + further * sin))
+        return blade.slanted(old, new, half, side, further)
 
     def beneath(
         self, way: Way, reach: blade.Reach, near: jax.Array, begin: jax.Array, ahead: jax.Array
@@ -200,9 +211,15 @@ class Advance(Step):
     ) -> tuple[Ready, jax.Array | None]:
         """The sand after `taken` of what was cut has left to the front, yet to come to rest, and what was lost."""
         h, flux, clear = state
-        way, pose = cut.way, frame_of(self.block.shape, cut.way.start).pose
+        way, frame = cut.way, frame_of(self.block.shape, cut.way.start)
+        pose = frame.pose
         room = self.block.part(view.holds if view.beyond is None else view.holds + view.beyond)
-        shares = blade.onward(spread(pose.cos, taken), spread(pose.sin, taken), room)
+        cos, sin = spread(pose.cos, taken), spread(pose.sin, taken)
+        if way.yaw is None:
+            shares = blade.onward(cos, sin, room)
+        else:
+            repose = jnp.arctan(self.block.part(jnp.broadcast_to(view.drop, h.shape)) * (way.quantum / way.spacing))
+            shares = blade.slid(cos, sin, spread(frame.mirrors(way.yaw), taken), repose)
         h, lost = self.block.displaced(way, view, shares, h, taken)
         around = self.block.around(view, cut.reach)
         sand = self.block.sand(way, view, clear, around)
@@ -217,6 +234,8 @@ class Advance(Step):
         """
         assert way.rise is not None
         behind = blade.behind_the_front(reach, spread(way.half, inner(reach.along)))
+        if way.yaw is not None:
+            behind = behind / jnp.cos(way.yaw)
         if way.room is not None:
             return (way.bottom + (by + way.half - behind) * way.rise) / way.quantum
         past = jnp.where(way.rise > 0, jnp.minimum(behind, by), 0)

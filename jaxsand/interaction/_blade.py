@@ -73,6 +73,16 @@ def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Ar
     return Reach(beside * (rear - front), beside * (rear - front_after), beside * after, beside, along - ahead, gone)
 
 
+def slanted(
+    old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Array], half: jax.Array, side: jax.Array, ahead: jax.Array
+) -> Reach:
+    """The footprints of a blade at an angle to its way, by the cells' coordinates along and across it before and after."""
+    beside, beside_after = share(old[1], -side, side), share(new[1], -side, side)
+    after = beside_after * share(new[0], -half, half)
+    swept = jnp.maximum(beside * share(old[0], -half, half + old[0] - new[0]), after)
+    return Reach(beside * share(old[0], -half, half), swept, after, beside_after, new[0], ahead)
+
+
 def turned(
     old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Array], half: jax.Array, side: jax.Array, angle: jax.Array
 ) -> Reach:
@@ -173,6 +183,17 @@ def onward(cos: jax.Array, sin: jax.Array, room: jax.Array) -> Shares:
         (1, 1): jnp.where(free, aslant * there / full, 0),
         (1, 0): jnp.where(free, 0, aslant * up),
     }
+
+
+def slid(cos: jax.Array, sin: jax.Array, yaw: jax.Array, repose: jax.Array) -> Shares:
+    """The shares of the eight neighbours for displacement by a blade at an angle `yaw` to its way, which is (cos, sin).
+
+    It is along the blade's normal, turned towards the way by the angle of repose at most.
+    """
+    angle = yaw - jnp.clip(yaw, -repose, repose)
+    p, q = cos * jnp.cos(angle) - sin * jnp.sin(angle), sin * jnp.cos(angle) + cos * jnp.sin(angle)
+    size = jnp.maximum(jnp.abs(p), jnp.abs(q))
+    return any_way(p / size, q / size)
 
 
 def any_way(p: jax.Array, q: jax.Array) -> Shares:

@@ -38,6 +38,7 @@ class Way:
         level: height of a draining rim, or None.
         rate: rate of the proximal steps.
         angle: angle by which the blade turns in place before the leg (rad).
+        yaw: angle from the direction of travel to the blade's normal (rad), or None if it stands square to its way.
         room: sum of heights that the tool's bucket can take up from the path's start on (quanta), or None if it has none.
     """
 
@@ -54,6 +55,7 @@ class Way:
     angle: jax.Array
     rise: jax.Array | None
     room: jax.Array | None = None
+    yaw: jax.Array | None = None
 
     def at(self, by: jax.Array) -> "Way":
         """The leg as it is when the blade has moved by a length (spacings): with its bottom at the height there."""
@@ -282,6 +284,17 @@ class Block:
         spacing, bottom = way.spacing / way.quantum, way.bottom / way.quantum
         near = jnp.clip(1 + jnp.maximum(self.part(h) - bottom, -spacing) / spacing, 0, 1) * at(self.part(view.holds))
         return jnp.minimum(1, 2 * jnp.max(jnp.max(near * cover, axis=0), axis=0))
+
+
+def normal_of(way: Way, pose: Pose) -> Pose:
+    """The pose, on the map, with the heading of the blade's normal."""
+    return pose if way.yaw is None else rotated(pose, way.yaw)
+
+
+def rotated(pose: Pose, angle: jax.Array) -> Pose:
+    """The pose turned in place by an angle (rad), counter-clockwise."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return Pose(pose.x, pose.y, pose.cos * cos - pose.sin * sin, pose.sin * cos + pose.cos * sin)
 
 
 def pose_ahead(frame: Frame, by: jax.Array) -> Pose:

@@ -29,6 +29,10 @@ class Frame:
     swap: jax.Array
     shape: tuple[int, int] = field(metadata={"static": True})
 
+    def mirrors(self, angle: jax.Array) -> jax.Array:
+        """An angle, counter-clockwise on the map, as this frame has it."""
+        return jnp.where(self.flip_x ^ self.flip_y ^ self.swap, -angle, angle)
+
     def extent(self) -> tuple[jax.Array, jax.Array]:
         """The numbers of columns and rows of the map in this frame."""
         rows, columns = self.shape

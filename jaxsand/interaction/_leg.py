@@ -19,7 +19,7 @@ from jaxsand.interaction._path import State, over_the_map, turn_between
 from jaxsand.interaction.resting import no_flux
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Pose, reach
+from jaxsand.scene.tools import Blade, Pose, reach
 
 
 class Repeated(LoopStep, Protocol):
@@ -127,6 +127,7 @@ def _turned(
 def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.Array, side: jax.Array) -> Way:
     """A leg in spacings, of a tool that reaches by `half` ahead and by `side` aside (spacings); see `Way`."""
     dx, drop, rim = job.bed.spacing, job.bed.drop, job.bed.rim
+    yaw = job.tool.yaw if isinstance(job.tool, Blade) else None
     return Way(
         _in_spacings(pose, dx),
         length / dx,
@@ -141,6 +142,7 @@ def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.
         angle,
         None if job.rise is None else job.rise * dx,
         None if job.room is None else job.room / job.flow.quantum,
+        None if yaw is None else jnp.asarray(yaw),
     )
 
 

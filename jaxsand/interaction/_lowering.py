@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._advance import Step
-from jaxsand.interaction._block import Moving, Way
+from jaxsand.interaction._block import Moving, Way, normal_of
 from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at, truncate
@@ -25,7 +25,7 @@ class Lower(Step):
     tape: int = 1
 
     def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
-        frame = frame_of(self.block.shape, way.start)
+        frame = frame_of(self.block.shape, normal_of(way, way.start))
         pose, first = frame.pose, self.block.corner(frame.pose.x, frame.pose.y)
         view, whole = self.block.view(way, frame, first, sand.height)
         holds, old = self.block.part(view.holds), self.block.part(whole)

@@ -11,9 +11,8 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat_until
 from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import Step
-from jaxsand.interaction._block import Block, Moving, View, pose_ahead
+from jaxsand.interaction._block import Block, Moving, View, pose_ahead, rotated
 from jaxsand.interaction._frame import Frame, frame_of, shifted
-from jaxsand.interaction._turning import rotated
 from jaxsand.interaction._wheel import Stand, Track
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.relaxation.flux import Fluxes

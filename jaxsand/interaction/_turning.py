@@ -8,12 +8,11 @@ import jax.numpy as jnp
 
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._advance import Rest, Step
-from jaxsand.interaction._block import Moving, Way
+from jaxsand.interaction._block import Moving, Way, normal_of, rotated
 from jaxsand.interaction._frame import Frame
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at
-from jaxsand.scene.tools import Pose
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,9 @@ class Turn(Step):
         part = ahead / whole
         sign = jnp.where(way.angle < 0, -1.0, 1.0).astype(begin.dtype)
         no = jnp.zeros((), bool)
-        frame = Frame(rotated(way.start, sign * begin), no, no, no, self.block.shape)
-        after = replace(frame, pose=rotated(way.start, sign * (begin + ahead)))
+        start = normal_of(way, way.start)
+        frame = Frame(rotated(start, sign * begin), no, no, no, self.block.shape)
+        after = replace(frame, pose=rotated(start, sign * (begin + ahead)))
         pose, first = frame.pose, self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
         now, then = self.block.coordinates(frame, first), self.block.coordinates(after, first)
@@ -59,9 +59,3 @@ class Turn(Step):
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))
         account = self.block.lose(way, view, sand.lost, gone)
         return Moving(self.block.back(way, view, sand.height, new), account, flux, edge, sand.scooped)
-
-
-def rotated(pose: Pose, angle: jax.Array) -> Pose:
-    """The pose turned in place by an angle (rad), counter-clockwise."""
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-    return Pose(pose.x, pose.y, pose.cos * cos - pose.sin * sin, pose.sin * cos + pose.cos * sin)

@@ -58,7 +58,7 @@ class Track:
 
     def seen(self, frame: Frame) -> jax.Array:
         """The slip angle in a frame, where a mirror changes its sign."""
-        return jnp.where(frame.flip_x ^ frame.flip_y ^ frame.swap, -self.slip, self.slip)
+        return frame.mirrors(self.slip)
 
 
 @jax.tree_util.register_dataclass

@@ -38,7 +38,7 @@ from jaxsand.relaxation.ghost_cells import Lost, lose
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade, NoTool, Pose, coverage, local
+from jaxsand.scene.tools import Blade, NoTool, Pose, coverage, local, square
 from jaxsand.scene.window import Whole
 
 # Shapes, fitted to SteppedPush.fine() with blades of 2 to 16 cells; lengths are shares of the reach r, or cells.
@@ -100,6 +100,8 @@ class SwathPush:
             raise ValueError(
                 f"push: got SwathPush for a {type(scene.tool).__name__}; SwathPush() is for a Blade, SteppedPush() for both"
             )
+        if isinstance(scene.tool, Blade):
+            square(scene.tool)
         check_whole("push.sweeps", self.sweeps, 0)
         check_rate(scene, "push.rate", self.rate)
 

@@ -15,7 +15,7 @@ from jaxsand.scene.boundaries import Closed, Draining, Open, Walls
 from jaxsand.scene.grid import Grid, Neighbours
 from jaxsand.scene.masked import BED, unmasked
 from jaxsand.scene.material import DRY_SAND, Material
-from jaxsand.scene.tools import Blade, NoTool, Tool
+from jaxsand.scene.tools import Blade, NoTool, Tool, square
 from jaxsand.scene.validation import concrete, finite, positive
 from jaxsand.scene.window import AsNeeded, Whole, Window
 
@@ -130,9 +130,10 @@ def make_scene(
 
 
 def blade_of(scene: Scene) -> Blade:
-    """The scene's blade; raises ValueError if its tool is another."""
+    """The scene's blade; raises ValueError if its tool is another, or the blade does not stand square to its way."""
     if not isinstance(scene.tool, Blade):
         raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
+    square(scene.tool)
     return scene.tool
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsand.scene.grid import Grid
 from jaxsand.scene.validation import concrete, finite, positive, short
 
+MOST_YAW = math.pi / 3  # the largest angle of a blade to its way (rad)
 Scalar = Float[Array, ""]
 Number = Scalar | float
 
@@ -56,15 +57,21 @@ class NoTool:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Blade:
-    """A flat upright blade that is pushed perpendicular to its face.
+    """A flat upright blade that is pushed perpendicular to its face, or at an angle to it.
 
     While it is lowered, its bottom edge is at height -depth. The depth is measured from height 0 and not from the surface
     of the sand, so that a blade of negative depth passes above a level map of height 0.
 
+    A blade at an angle throws a windrow to one side: its left end leads where the angle is negative, and the sand leaves to
+    the left where it is positive. What the blade covers leaves along its normal, turned towards the way by the angle of
+    repose at most, as sand that slides on sand would.
+
     Attributes:
-        width: extent across the direction of travel (m), at least one cell.
-        thickness: extent along the direction of travel (m), at least one cell.
+        width: extent along its face (m), at least one cell.
+        thickness: extent along its normal (m), at least one cell.
         depth: depth of the bottom edge below height 0 (m).
+        yaw: angle from the direction of travel to the blade's normal (rad), counter-clockwise, -pi/3 to pi/3; None for a
+            blade that stands square to its way, which costs nothing.
 
     Example:
         >>> import jaxsand as js
@@ -76,12 +83,18 @@ class Blade:
     width: Number = 0.02
     thickness: Number = 0.015
     depth: Number = 0.0075
+    yaw: Number | None = None
 
     def check(self, grid: Grid) -> None:
-        """Raises ValueError if a length is out of range, or less than a cell; see `Tool`."""
+        """Raises ValueError if a length or the angle is out of range, or a length less than a cell; see `Tool`."""
         positive("tool.width", self.width, "give the blade's width in metres")
         positive("tool.thickness", self.thickness, "give the blade's thickness in metres")
         finite("tool.depth", self.depth, "give the depth of the blade's bottom below height 0 in metres")
+        if self.yaw is not None:
+            finite("tool.yaw", self.yaw, "give the angle from the way to the blade's normal in rad, or None")
+            yaw = concrete(self.yaw)
+            if yaw is not None and abs(yaw) > MOST_YAW * (1 + 1e-6):
+                raise ValueError(f"tool.yaw: got {self.yaw!r} rad; give -pi/3 to pi/3: for degrees use math.radians(30)")
         thickness, dx = concrete(self.thickness), concrete(grid.spacing)
         if thickness is None or dx is None:
             return
@@ -239,6 +252,12 @@ def _within_the_map(sizes: dict[str, Number], grid: Grid) -> None:
             )
 
 
+def square(blade: Blade) -> None:
+    """Raises ValueError unless the blade stands square to its way."""
+    if blade.yaw is not None:
+        raise ValueError(f"scene.tool.yaw: got {short(blade.yaw)}; give a blade that stands square to its way, yaw=None")
+
+
 def lowest(tool: Blade | Wheel) -> Scalar:
     """The height of the tool's lowest point (m)."""
     return -jnp.asarray(tool.sinkage if isinstance(tool, Wheel) else tool.depth)
@@ -252,6 +271,8 @@ def usable(tool: Tool) -> Bool[Array, ""]:
     if isinstance(tool, Wheel):
         good = good & (tool.sinkage >= 0) & (tool.sinkage <= tool.radius)
         good = good & (jnp.abs(tool.slip_angle) <= math.pi / 2 * (1 + 1e-6))
+    if isinstance(tool, Blade) and tool.yaw is not None:
+        good = good & (jnp.abs(tool.yaw) <= MOST_YAW * (1 + 1e-6))
     return good
 
 
@@ -279,6 +300,8 @@ def reach(tool: Blade | Wheel) -> Scalar:
     """The largest distance (m) from the tool's centre to its front, along the direction of travel."""
     if isinstance(tool, Wheel):
         return jnp.hypot(tool.radius, jnp.asarray(tool.width) / 2)
+    if tool.yaw is not None:
+        return jnp.hypot(tool.thickness, jnp.asarray(tool.width)) / 2
     return jnp.asarray(tool.thickness) / 2
 
 

@@ -22,7 +22,7 @@ from jax import lax
 
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, cast, fit
-from jaxsand.scene.tools import Blade, Pose, coverage
+from jaxsand.scene.tools import Blade, Pose, coverage, square
 from jaxsand.scene.validation import concrete
 
 Scalar = jax.Array | float
@@ -278,6 +278,7 @@ def blade_force(scene: Scene, height: jax.typing.ArrayLike, pose: Pose, soil: So
     blade, dx = scene.tool, jnp.asarray(scene.grid.spacing)
     if not isinstance(blade, Blade):
         raise ValueError(f"tool: got {blade!r}; give the scene a Blade(width, thickness, depth)")
+    square(blade)
     soil, pose, level = cast((soil, pose, level), height.dtype)
     ahead = jnp.asarray(blade.thickness) / 2 + 1.5 * dx
     middle = Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin)

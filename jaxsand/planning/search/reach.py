@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxsand.scene.boundaries import Closed
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade
+from jaxsand.scene.tools import Blade, square
 
 
 def least_distance(scene: Scene, height: np.ndarray, goal: np.ndarray, strokes: int, longest: float) -> float:
@@ -88,6 +88,7 @@ def blade_size(scene: Scene) -> tuple[float, float, float]:
     blade = scene.tool
     if not isinstance(blade, Blade):
         raise ValueError(f"scene.tool: got {type(blade).__name__}, which moves no sand; give make_scene(..., tool=Blade())")
+    square(blade)
     return float(blade.width), float(blade.thickness), float(blade.depth)
 
 
