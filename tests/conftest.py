@@ -55,8 +55,14 @@ def _way(item: pytest.Item) -> dict[str, Any]:
     return next((options for name, options in WAYS.items() if item.get_closest_marker(name)), HURRY)
 
 
+def _hurried(item: pytest.Item) -> bool:
+    """Whether this is the hurried one of two that are alike; where both are slow, and so compiled, the other is enough."""
+    return hasattr(item, "callspec") and item.callspec.params.get("both_ways") == "hurried"
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """In each file, what is compiled in one way runs together."""
+    items[:] = [item for item in items if not (_hurried(item) and item.get_closest_marker("slow"))]
     files, ways = list(dict.fromkeys(item.path for item in items)), [HURRY, *WAYS.values()]
     items.sort(key=lambda item: (files.index(item.path), ways.index(_way(item))))
 
@@ -81,6 +87,16 @@ def turned(stroke: Sequence[float], side: float) -> list[tuple[Callable, tuple[f
     ]
 
 
+def padded(path: Sequence[Any], points: int) -> np.ndarray:
+    """The path with its end repeated, which changes nothing: paths of as many points are one program."""
+    return np.concatenate([path, np.repeat(np.asarray(path)[-1:], points - len(path), axis=0)])
+
+
 @pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def dtype(request: pytest.FixtureRequest) -> str:
     return request.param
+
+
+@pytest.fixture(params=["hurried", pytest.param("compiled", marks=pytest.mark.slow)])
+def both_ways() -> None:
+    """By default a test runs in a hurry, and among the slow ones again, compiled as users do."""

@@ -8,7 +8,7 @@ import pytest
 
 import jaxsand as js
 
-pytestmark = pytest.mark.compiled
+pytestmark = pytest.mark.usefixtures("both_ways")
 
 SHAPE = (64, 64)
 

@@ -58,7 +58,12 @@ def run(path, slow):
     return names
 
 
-@pytest.mark.parametrize("path", runnable(slow=False), ids=named)
+def fast(path):
+    """A page by its marks: where environments draw all their goals, that is most of it."""
+    return pytest.param(path, marks=pytest.mark.long if path.name == "environments.md" else ())
+
+
+@pytest.mark.parametrize("path", [fast(path) for path in runnable(slow=False)], ids=named)
 def test_code_runs(path):
     names = run(path, slow=False)
     if path == README:

@@ -50,7 +50,9 @@ def test_c_equals_jaxsand():
         settle_c(maps.astype(float), DX, MU)
 
 
-def test_the_benchmark_of_settling_reports_rates_that_fit_together():
+@pytest.mark.long
+def test_the_benchmark_of_settling_reports_rates_that_fit_together(monkeypatch):
+    monkeypatch.setattr(benchmark, "_ROUNDS", 1)
     check_rates({"machine": "", "batch": 2, "map": [32, 32], "settle": benchmark.bench_settle(2)})
 
 

@@ -146,7 +146,7 @@ def test_the_angle_of_repose_may_differ_from_one_environment_to_the_next():
     assert len(np.unique(np.asarray(many[2]).round(4))) == 5
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(("size", "chunk"), [(7, 2), (1, 4), (5, 8)])
 def test_sorting_a_batch_changes_no_map(size, chunk):
     """Whatever is numpy's and whatever is batched; the next test does it with a real push."""
@@ -165,7 +165,7 @@ def test_sorting_a_batch_changes_no_map(size, chunk):
     chex.assert_trees_all_close(seeds, expected)
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_a_batch_by_length_is_its_maps():
     push = ByLength(2).pushing(QUICK, js.Sweeps(8))
     rng = np.random.default_rng(1)

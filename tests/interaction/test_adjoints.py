@@ -20,16 +20,16 @@ PATH = np.array([[0.0413, 0.0627], [0.1131, 0.0842], [0.0727, 0.0311]])
 def central(f, x, seed=0, e=1e-7):
     """The gradient of f at a tuple x; checked, along one random direction of each argument, both ways."""
     slopes = jax.jit(jax.grad(f, range(len(x))))(*x)
-    value, forward = jax.jit(f), jax.jit(lambda x, v: jax.jvp(f, x, v)[1])
+    forward = jax.jit(lambda x, v: jax.jvp(f, x, v))
     size = np.sqrt(sum(np.sum(np.square(np.nan_to_num(g))) for g in slopes))
     for i, g in enumerate(slopes):
         v = np.random.default_rng(seed).standard_normal(np.shape(x[i]))
         v = np.where(np.isfinite(x[i]), v / np.linalg.norm(v), 0)
-        up, down = (value(*x[:i], x[i] + s * e * v, *x[i + 1 :]) for s in (1, -1))
+        tangents = tuple(jnp.asarray(v) if k == i else jnp.zeros_like(a) for k, a in enumerate(x))
+        up, down = (forward((*x[:i], x[i] + s * e * v, *x[i + 1 :]), tangents)[0] for s in (1, -1))
         slope = float(np.sum(np.where(v == 0, 0, g) * v))
         assert slope == pytest.approx(float(up - down) / (2 * e), rel=1e-5, abs=1e-5 * size), i
-        tangents = tuple(jnp.asarray(v) if k == i else jnp.zeros_like(a) for k, a in enumerate(x))
-        assert float(forward(x, tangents)) == pytest.approx(slope, rel=1e-8, abs=1e-9 * size), i
+        assert float(forward(x, tangents)[1]) == pytest.approx(slope, rel=1e-8, abs=1e-9 * size), i
     return slopes
 
 
@@ -42,7 +42,8 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if "window" in n else pytest.mark.slow) for n in WAYS])
+@pytest.mark.slow  # by default, test_gradients.py and relaxation/test_settling.py have the derivatives' parts
+@pytest.mark.parametrize("name", WAYS)
 def test_a_path_of_two_legs(name):
     options = dict(WAYS[name])
     walls, angle = options.pop("walls", None), jnp.asarray(options.pop("angle", 0.5))

@@ -33,7 +33,7 @@ def level(dtype="float64"):
     return np.zeros(SHAPE, dtype)
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_volume_is_kept(dtype):
     wild = np.random.default_rng(2).uniform(-0.05, SIDE + 0.05, (32, 4)).astype(dtype)
     for start, limit in ((level(dtype), 0.0), (rough(dtype), 1e-6 if dtype == "float32" else 1e-14)):
@@ -56,7 +56,7 @@ def test_a_wide_trench_has_a_floor_berms_and_a_heap(dtype):
     assert h[8:10, 10:20].min() > 0
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_mirrors_and_quarter_turns(dtype):
     start, atol = np.asarray(rough(dtype)), 4e-6 if dtype == "float32" else 1e-12
     h = np.asarray(js.step(scene(), start, STROKE, push=FAST).height)
@@ -180,7 +180,7 @@ def test_sand_pushed_over_a_draining_edge_is_counted(dtype):
     assert float(away.drained) == 0
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_vmap_equals_a_loop():
     strokes, maps = BATCH[:4].astype(np.float32), np.stack([rough("float32", k) for k in range(4)])
     loop = [js.step(scene(), h, s, push=FAST).height for h, s in zip(maps, strokes, strict=True)]

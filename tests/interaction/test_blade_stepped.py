@@ -72,7 +72,7 @@ def test_no_sand_inside_the_tool(dtype):
         assert inside.max() <= -BLADE.depth + (1e-8 if dtype == "float32" else 1e-15)
 
 
-@pytest.mark.compiled
+@pytest.mark.long
 def test_volume_after_a_thousand_random_pushes():
     shape, n = (32, 32), 1000
     sand = js.make_scene(shape, 0.01, ANGLE, tool=js.Blade())
@@ -155,7 +155,7 @@ def test_passes_clean_and_deeper_ones_deepen(dtype):
     assert np.asarray(twice.height)[32, 40] == pytest.approx(-0.0075, rel=0.01)
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_mirrors_and_quarter_turns(dtype):
     tolerance = 2e-6 if dtype == "float32" else 1e-12
     shape = (48, 48)
@@ -174,7 +174,7 @@ def test_sand_and_blade_may_be_raised_together():
     assert np.allclose(np.asarray(b) - 0.5, a, atol=1e-9)
 
 
-@pytest.mark.compiled
+@pytest.mark.long
 def test_the_result_is_continuous_in_the_stroke():
     """Steps of a stroke, over several sub-steps' lengths, move the sand by no more than a fixed multiple of their size: by 10,
     but where a blade in line with the cells moves into slivers of them, which is as steep as these are narrow."""
@@ -274,7 +274,7 @@ def test_more_sweeps_and_finer_sub_steps_converge():
     assert errors[1] < 0.12
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_vmap_equals_a_loop_over_maps_and_strokes():
     sand = js.make_scene((24, 24), 0.01, ANGLE, tool=js.Blade())
     rng = np.random.default_rng(5)

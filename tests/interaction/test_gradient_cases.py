@@ -147,7 +147,7 @@ def check_smooth_points(case, least, most):
         found, tried = found + int(smooth.all(0).sum()), tried + 100
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gradients_are_right_at_fifty_smooth_points():
     check_smooth_points(Case(True), 50, 300)
 

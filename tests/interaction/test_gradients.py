@@ -21,8 +21,8 @@ def loss(stroke, width, thickness, depth, angle, height):
     return jnp.sum(WEIGHTS * js.step(scene, height, stroke).height)
 
 
-value, gradient = jax.jit(loss), jax.jit(jax.grad(loss, range(6)))
-forward = jax.jit(lambda x, v: jax.jvp(loss, x, v)[1])
+gradient = jax.jit(jax.grad(loss, range(6)))
+forward = jax.jit(lambda x, v: jax.jvp(loss, x, v))
 
 
 def point(seed):
@@ -33,7 +33,7 @@ def point(seed):
     return (rng.uniform(0.03, 0.17, 4), 0.023, 0.0152, 0.0077, 0.5, height)
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_push_and_its_settling(seed):
     x = tuple(jnp.asarray(v, float) for v in point(seed))
@@ -44,12 +44,17 @@ def test_a_push_and_its_settling(seed):
         v = np.random.default_rng(seed).standard_normal(x[i].shape)
         v = v / np.linalg.norm(v)
         e = 1e-7
-        up, down = ([*x[:i], x[i] + sign * e * v, *x[i + 1 :]] for sign in (1, -1))
-        difference = float(value(*up) - value(*down)) / (2 * e)
-        slope = float(jnp.sum(g[i] * v))
-        assert slope == pytest.approx(difference, rel=1e-5, abs=1e-5 * size), name
         tangents = tuple(jnp.asarray(v) if k == i else jnp.zeros_like(a) for k, a in enumerate(x))
-        assert float(forward(x, tangents)) == pytest.approx(slope, rel=1e-9, abs=1e-12)
+        up, down = (forward((*x[:i], x[i] + sign * e * v, *x[i + 1 :]), tangents)[0] for sign in (1, -1))
+        slope = float(jnp.sum(g[i] * v))
+        assert slope == pytest.approx(float(up - down) / (2 * e), rel=1e-5, abs=1e-5 * size), name
+        assert float(forward(x, tangents)[1]) == pytest.approx(slope, rel=1e-9, abs=1e-12)
+
+
+def test_where_nothing_changes_there_is_no_gradient():
+    x = tuple(jnp.asarray(v, float) for v in point(0))
+    assert np.array_equal(gradient(jnp.array([5.0, 5.0, 6.0, 6.0]), *x[1:])[0], np.zeros(4))
+    assert np.all(np.isfinite(gradient(jnp.array([0.1013, 0.0972] * 2), *x[1:])[0]))  # no length: finite all the same
 
 
 def test_the_gradient_of_settling_is_that_of_its_sweeps():
@@ -77,6 +82,7 @@ def test_a_blade_of_no_width_has_finite_derivatives():
     assert np.all(np.isfinite(slopes))
 
 
+@pytest.mark.slow  # by default, batches' gradients are those of test_batched.py
 def test_gradients_under_vmap_and_jit_and_where_nothing_changes():
     scene = js.make_scene(SHAPE, 0.01, ANGLE, tool=js.Blade())
     strokes = jnp.array(

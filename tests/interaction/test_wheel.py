@@ -53,7 +53,7 @@ def rolled(push, start=None, stroke=STROKE, sand=None):
     return np.asarray(out.height)
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 @both
 def test_volume_is_kept(dtype, push):
     """In a corner a wheel heaps up columns of half a metre, whose float32 are coarser than the quanta."""
@@ -88,7 +88,7 @@ def test_the_sand_rests_and_lies_no_deeper_than_the_wheel_went(dtype, push):
             assert float(js.steepest_slope(sand, h)) <= MU + 1.1e-3
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 @both
 def test_mirrors_turns_and_slip_to_the_other_side(dtype, push):
     start, atol = rough(dtype), 1e-5 if dtype == "float32" else 1e-12
@@ -292,6 +292,7 @@ def distances(spacing, spin=0.0):
     return np.abs([h - exact(across) for h, exact in zip(left_to_right, relaxed(runs, 5e-4), strict=True)])
 
 
+@pytest.mark.long
 def test_the_push_in_one_go_is_the_exact_relaxation_to_the_spacing():
     spacings = (0.01, 0.005, 0.0025)
     errors = [distances(spacing) for spacing in spacings]
@@ -301,6 +302,7 @@ def test_the_push_in_one_go_is_the_exact_relaxation_to_the_spacing():
     assert distances(0.005, 2.0).max() < 0.1 * 0.005
 
 
+@pytest.mark.long
 def test_grousers_fill_the_trench_in_one_go():
     for slip in (0.0, 1.2, math.pi / 2):
         maps = [trench(Pass(slip, 0.015, spin=spin), 0.005)[:, 6] for spin in (0.0, 2.0, 5.0, 1e6)]
@@ -308,7 +310,7 @@ def test_grousers_fill_the_trench_in_one_go():
     assert np.array_equal(maps[-1], np.zeros(LONG[0]))  # of two piles alike nothing remains
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 @heavy
 def test_vmap_and_batches_equal_a_loop(push):
     strokes = np.random.default_rng(5).uniform(0.05, 0.35, (3, 4)).astype(np.float32)
@@ -332,7 +334,7 @@ def test_other_wheels_and_strokes_need_no_other_program(push):
     assert simulate._follow._cache_size() == before
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_a_window_that_follows_the_wheel():
     window = js.Window((36, 24), 1e-3)
     stroke = np.array([0.17, 0.2, 0.22, 0.2])

@@ -73,20 +73,24 @@ def test_gradients(push):
     assert not np.any(value_and_grad(*ends[1])[1][0])
 
 
+def left(v):
+    """Of a pass in one go, by slip angle, sinkage, radius, width, and how far to the side."""
+    wheel = js.Wheel(sinkage=v[1], radius=v[2], width=v[3], slip_angle=v[0])
+    sand = js.make_scene((41, 41), 0.008, ANGLE, tool=wheel)
+    stroke = jnp.array([0.1013, 0.1643, 0.2227, 0.1643]) + v[4] * jnp.array([0, 1, 0, 1])
+    return 1e6 * jnp.sum(js.step(sand, jnp.zeros((41, 41)), stroke, push=SPLIT).height ** 2)
+
+
+left_and_slopes = quick(lambda some: jax.lax.map(jax.value_and_grad(left), some))
+
+
 @pytest.mark.parametrize(("slip", "which"), [(0.0, 3), (0.7, 3), (0.7, 0), (0.7, 4)])
 def test_derivatives_in_one_go_add_up_to_the_change(slip, which):
     """Over a cell's width, in steps larger than a sample: edges of the cut count."""
-
-    def left(v):
-        wheel = js.Wheel(sinkage=v[1], radius=v[2], width=v[3], slip_angle=v[0])
-        sand = js.make_scene((41, 41), 0.008, ANGLE, tool=wheel)
-        stroke = jnp.array([0.1013, 0.1643, 0.2227, 0.1643]) + v[4] * jnp.array([0, 1, 0, 1])
-        return 1e6 * jnp.sum(js.step(sand, jnp.zeros((41, 41)), stroke, push=SPLIT).height ** 2)
-
     base, steps = np.array([slip, 0.0153, 0.0481, 0.0507, 0.0007]), np.linspace(-1, 1, 41)
     many = np.repeat(base[None], len(steps), axis=0)
     many[:, which] += steps * (0.1 if which == 0 else 0.004)
-    values, slopes = quick(lambda some: jax.lax.map(jax.value_and_grad(left), some))(many)
+    values, slopes = left_and_slopes(many)
     summed = np.trapezoid(slopes[:, which], many[:, which])
     assert abs(summed - (values[-1] - values[0])) < 0.03 * np.ptp(values)
 

@@ -21,7 +21,7 @@ def shape(target, before=None):
     return pipeline.shape(target, None if before is None else np.asarray(before))
 
 
-@pytest.mark.parametrize("letter", "SAQ")
+@pytest.mark.parametrize("letter", ["A", *(pytest.param(letter, marks=pytest.mark.slow) for letter in "SQ")])
 def test_a_letter_map_is_trenched(letter):
     dig, start = letters.letter_map(letter)
     result = shape(pipeline.map_target(dig, start, letter, pipeline.Layout()))
@@ -35,7 +35,10 @@ def test_a_letter_map_is_trenched(letter):
     assert volume_error(result.before, result.after) <= 1e-6
 
 
-@pytest.mark.parametrize("letter", string.ascii_uppercase)
+LETTERS = [pytest.param(a, marks=() if a in "IT" else pytest.mark.slow) for a in string.ascii_uppercase]
+
+
+@pytest.mark.parametrize("letter", LETTERS)
 def test_every_letter_runs(letter):
     dig, start = letters.letter_map(letter)
     result = shape(pipeline.map_target(dig, start, letter, pipeline.Layout()))
@@ -44,6 +47,12 @@ def test_every_letter_runs(letter):
     own = shape(pipeline.glyph_target(letters.letter_strokes(letter), letter))
     assert own.figures["iou"] == own.figures["l2_reduction"] == 1
     assert own.figures["volume_error"] <= 1e-6
+
+
+@pytest.mark.parametrize("letter", string.ascii_uppercase)
+def test_every_letter_is_planned(letter):
+    dig, start = letters.letter_map(letter)
+    assert pipeline.map_target(dig, start, letter, pipeline.Layout()).optimal
 
 
 def test_a_glyph_pushed_by_its_own_strokes_is_its_goal():

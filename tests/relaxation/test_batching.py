@@ -10,7 +10,7 @@ from jaxsand.relaxation import batching as batch
 
 from ..conftest import ANGLE
 
-pytestmark = pytest.mark.compiled
+pytestmark = pytest.mark.usefixtures("both_ways")
 
 SHAPE, DX = (16, 12), 0.01
 

@@ -42,7 +42,7 @@ def distance(got, end, begin):
     return np.abs(np.asarray(got) - end).max() / np.abs(end - begin).max()
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(("scheme", "neighbours"), CASES)
 def test_every_scheme_keeps_volume_and_comes_to_rest(scheme, neighbours):
     for shape in ((32, 32), (33, 38)):
@@ -57,7 +57,7 @@ def test_every_scheme_keeps_volume_and_comes_to_rest(scheme, neighbours):
         assert np.array_equal(again.height, s.height)
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("neighbours", NEIGHBOURS)
 def test_symmetries_hold(neighbours):
     """To the last bit where pairs flow on one grid; lengths of gradients and changes of coarse cells are rounded."""

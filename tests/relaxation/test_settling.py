@@ -91,7 +91,7 @@ def test_height_and_spacing_scale_together():
     assert np.array_equal(8 * np.asarray(s), t)
 
 
-@pytest.mark.compiled
+@pytest.mark.usefixtures("both_ways")
 def test_jit_equals_eager_and_vmap_equals_a_loop(dtype):
     maps = np.stack([rough((16, 16), dtype, seed) * (1 + seed) for seed in range(4)]).astype(dtype)
     scene = js.make_scene((16, 16), DX, ANGLE)
@@ -118,6 +118,18 @@ def test_vmap_over_materials():
         assert np.array_equal(one, js.settle(js.make_scene((16, 16), DX, float(angle)), h).height)
     slopes = [float(js.steepest_slope(js.make_scene((16, 16), DX), m)) for m in many]
     assert np.all(np.abs(np.array(slopes) - np.tan(angles)) < 2e-3)
+
+
+def test_the_gradient_by_a_map_of_angles_is_right():
+    h, weights = rough((9, 10), "float64", scale=0.03), rough((9, 10), "float64", seed=1)
+
+    def loss(angles):
+        return jnp.sum(weights * js.settle(js.make_scene(h.shape, DX, angles), h, stop=js.Sweeps(8)).height)
+
+    angles, way = jnp.asarray(0.5 + rough((9, 10), "float64", seed=2)), rough((9, 10), "float64", seed=3)
+    slope, value = jax.jit(jax.grad(loss))(angles), jax.jit(loss)
+    difference = float(value(angles + 1e-6 * way) - value(angles - 1e-6 * way)) / 2e-6
+    assert float(jnp.sum(slope * way)) == pytest.approx(difference, rel=1e-5)
 
 
 def test_every_cell_may_have_its_own_angle():

@@ -38,18 +38,20 @@ def off(found, degrees):
 
 
 @pytest.mark.long
-def test_one_noisy_collapse_tells_the_angle_and_how_well():
+@pytest.mark.parametrize("seeds", [range(0, 24, 5), pytest.param(range(24), marks=pytest.mark.slow)], ids=len)
+def test_one_noisy_collapse_tells_the_angle_and_how_well(seeds):
     """Within 0.2 degrees for angles from 20 to 40, and from wrong guesses; errors over standard errors spread by 1."""
     pulls = []
-    for seed in range(24):
+    for seed in seeds:
         true, guess = 20 + seed * 20 / 23, 15 + (seed * 7 % 31)
         found = js.calibrate(sand(guess), js.Trial(PILLAR, collapsed(true) + noise(seed)), free=ANGLE)
         assert not found.verdict
         assert abs(off(found, true)) < 0.2
         assert found.noise == pytest.approx(NOISE, rel=0.1)
         pulls.append(off(found, true) / math.degrees(found.noise_errors["repose_angle"]))
-    assert 0.7 < np.std(pulls) < 1.35
-    assert abs(np.mean(pulls)) < 0.65  # three of its standard deviations
+    if len(seeds) == 24:  # enough to tell
+        assert 0.7 < np.std(pulls) < 1.35
+        assert abs(np.mean(pulls)) < 0.65  # three of its standard deviations
 
 
 @pytest.mark.slow
@@ -75,7 +77,7 @@ def check_cones(rows):
 
 @pytest.mark.long
 def test_the_exact_cones_angle_lies_within_two_stated_errors():
-    check_cones(bench_cone(seeds=4))
+    check_cones(bench_cone(seeds=1))
 
 
 @pytest.mark.slow
@@ -93,7 +95,7 @@ def ridge(degrees, half, height):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("neighbours", [4, 8])
+@pytest.mark.parametrize("neighbours", [pytest.param(4, marks=pytest.mark.slow), 8])
 def test_ridges_and_slots_have_small_error_bars_that_hold_the_exact_angle(neighbours):
     """One dimension: neighbourhoods agree, and what is left is where a toe and a crest lie in their cells."""
     scene, errors = js.make_scene(SHAPE, DX, math.radians(26), neighbours), []
@@ -110,6 +112,7 @@ def test_ridges_and_slots_have_small_error_bars_that_hold_the_exact_angle(neighb
     assert np.median(errors) < 0.6
 
 
+@pytest.mark.long
 def test_the_grids_error_is_told_through_gaps():
     """Half of the cone unseen: the same error of the grid."""
     before, after = cone(29.0)
@@ -124,6 +127,7 @@ def test_the_grids_error_is_told_through_gaps():
     assert gaps.covariance[0, 0] == pytest.approx(gaps.errors["repose_angle"] ** 2)
 
 
+@pytest.mark.long
 def test_an_error_that_is_not_known_is_no_number():
     """Left out, or with the sand's own angle beyond the range: the verdict says so, and the rest is the noise's."""
     before, after = cone(29.0)
@@ -171,6 +175,7 @@ def test_the_grids_error_of_a_push_is_told():
         assert 0 < found.noise_errors[name] < found.grid_errors[name] < found.errors[name] < found.values[name] / 3
 
 
+@pytest.mark.long
 def test_the_errors_are_the_cramer_rao_bound():
     """sigma over the length of the derivative, of the cells that were seen."""
     after = collapsed(29).copy()
@@ -209,6 +214,7 @@ def test_what_the_data_do_not_tell_is_said():
     assert found.covariance[1, 1] == math.inf
 
 
+@pytest.mark.long
 def test_a_wrong_model_is_said():
     """A pillar a tenth higher than it is said to be; and a range that does not hold the truth."""
     trial = js.Trial(PILLAR, collapsed(29, PILLAR * 1.1) + noise(4))

@@ -88,9 +88,9 @@ def test_scans_of_the_closed_form_say_what_the_closed_form_says(table):
 
 
 def test_the_window_that_follows_the_wheel_changes_nothing_that_matters(monkeypatch):
-    near = rut.simulate((45.0, 15.0), 4e-3, SteppedPush())
+    near = rut.simulate((45.0, 15.0), 8e-3, SteppedPush())
     monkeypatch.setattr(rut, "_AROUND", 10.0)
-    whole = rut.simulate((45.0, 15.0), 4e-3, SteppedPush())
+    whole = rut.simulate((45.0, 15.0), 8e-3, SteppedPush())
     assert np.abs(near.profile.z - whole.profile.z).max() < 1e-5
 
 

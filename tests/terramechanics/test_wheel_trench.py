@@ -14,6 +14,8 @@ from jaxsand.terramechanics.wheel_trench import Pass, Profile, cell_means, close
 
 from ..conftest import ANGLE, MU
 
+pytestmark = pytest.mark.long
+
 TRENCHES = [(beta, sinkage) for sinkage in (5, 15, 25) for beta in (0, 22.5, 45, 67.5, 90)]
 # Pavlov & Johnson's formulas and the relaxation of sections sampled every 0.5 mm (mm): depth, depth, left and right peak.
 TABLE = {

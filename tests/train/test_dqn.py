@@ -233,8 +233,8 @@ def test_a_chunk_may_be_vmapped_over_seeds():
         assert a.ndim < 3 or not np.array_equal(a[0], a[1])
 
 
-@pytest.mark.compiled
-@pytest.mark.parametrize("learner", [QUICK, pytest.param(replace(QUICK, backup=Sampled(), reach=3), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", [QUICK, replace(QUICK, backup=Sampled(), reach=3)])
 def test_small_maps_are_learned_and_a_beam_does_no_worse(learner):
     pool = shape_pool(Shapes(), jax.random.key(5), 64, (3, 3), jnp.zeros((0, 3, 3), bool))
     few, state = fewest(pool), learner.init(1)

@@ -24,10 +24,8 @@ def led_to(scene, current, due, counts):
     """The maps that strokes due leave, in their order."""
     maps = current
     for k in range(MOST):
-        here = np.flatnonzero(counts[:, k])
-        if here.size:
-            maps = maps.copy()
-            maps[here] = pushed(scene, maps[here], due[here, k])
+        if counts[:, k].any():
+            maps = np.where(counts[:, k, None, None], pushed(scene, maps, due[:, k]), maps)
     return maps
 
 

@@ -10,8 +10,6 @@ from train.ddpg.tasks import Probing
 from train.evaluation.probes import QUESTIONS, Line, Probe, Two
 from train.replay.her import Own
 
-pytestmark = pytest.mark.long
-
 
 def prober(question, **options):
     return Ddpg(
