@@ -50,9 +50,8 @@ def test_c_equals_jaxsand():
         settle_c(maps.astype(float), DX, MU)
 
 
-@pytest.mark.long
-def test_the_benchmark_of_settling_reports_rates_that_fit_together(monkeypatch):
-    monkeypatch.setattr(benchmark, "_ROUNDS", 1)
+@pytest.mark.slow
+def test_the_benchmark_of_settling_reports_rates_that_fit_together():
     check_rates({"machine": "", "batch": 2, "map": [32, 32], "settle": benchmark.bench_settle(2)})
 
 

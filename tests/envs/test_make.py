@@ -52,6 +52,12 @@ def test_rough_starts_are_at_rest_and_their_goals_are_made_from_them():
     assert (changed.min(1) > 0.1).all()
 
 
+def test_every_goal_is_drawn():
+    env, params = small(goals=np.float32([0.001, 0.002, 0.003])[:, None, None] * np.ones((3, 16, 16), np.float32))
+    _, states = jax.vmap(env.reset, (0, None))(jax.random.split(KEY, 32), params)
+    assert len(np.unique(np.asarray(states.goal).reshape(32, -1), axis=0)) == 3
+
+
 def test_only_what_is_dug_counts_for_drawn_goals():
     drawn = np.zeros((1, 16, 16), np.float32)
     drawn[0, 6:10, 6:10] = -0.0075

@@ -6,6 +6,11 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.autodiff.while_loop import repeat
+from jaxsand.interaction._contact_sweeps import Beside
+from jaxsand.relaxation.flux import stand
+from jaxsand.relaxation.ghost_cells import prepare, quantum
+from jaxsand.relaxation.sweep import Flow
 
 SHAPE = (14, 16)
 RNG = np.random.default_rng(4)
@@ -31,6 +36,18 @@ def central(f, x, seed=0, e=1e-7):
         assert slope == pytest.approx(float(up - down) / (2 * e), rel=1e-5, abs=1e-5 * size), i
         assert float(forward(x, tangents)[1]) == pytest.approx(slope, rel=1e-8, abs=1e-9 * size), i
     return slopes
+
+
+def test_sweeps_around_a_tool_that_stands_in_the_sand():
+    """Those of the closed form between two legs."""
+    bed, rng = prepare(js.make_scene(SHAPE, 0.01, 0.5)), np.random.default_rng(5)
+    cover = rng.uniform(0.1, 0.8, SHAPE)
+
+    def loss(height, cover, bottom, rate):
+        params = bed, Flow(rate, quantum(jnp.asarray(1.0))), stand(cover, bottom)
+        return jnp.sum(WEIGHTS * repeat(Beside(3), 1, params, (height, None))[0])
+
+    central(loss, tuple(jnp.asarray(v, float) for v in (rng.normal(0, 0.01, SHAPE), cover, -0.0061, 0.11)))
 
 
 WAYS = {

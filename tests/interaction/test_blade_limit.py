@@ -80,6 +80,7 @@ def test_a_turn_sweeps_and_does_not_depend_on_its_parts(neighbours):
     assert disc.mean() < -0.8 * 0.0075  # it dug where it swept
 
 
+@pytest.mark.slow
 def test_isotropic_sand_does_not_overshoot():
     """A blade whose ends leave quarters of cells open once dug up to 60% too much, in one place of hundreds, and below its
     own bottom: what was known of the flow over links that were closed came back when they opened."""

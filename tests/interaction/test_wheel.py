@@ -53,7 +53,7 @@ def rolled(push, start=None, stroke=STROKE, sand=None):
     return np.asarray(out.height)
 
 
-@pytest.mark.usefixtures("both_ways")
+@pytest.mark.long
 @both
 def test_volume_is_kept(dtype, push):
     """In a corner a wheel heaps up columns of half a metre, whose float32 are coarser than the quanta."""

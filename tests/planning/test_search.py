@@ -26,7 +26,7 @@ SCENE = js.make_scene(SHAPE, 0.01, tool=js.Blade())
 LEVEL = np.zeros(SHAPE, np.float32)
 STROKES = np.array([[0.03, 0.05, 0.11, 0.05], [0.03, 0.09, 0.11, 0.09]])
 GOAL = replay(SCENE, LEVEL, [s.reshape(2, 2) for s in STROKES])
-BUDGET = 300
+BUDGET = 200
 
 
 @pytest.fixture(scope="module")
