@@ -143,7 +143,8 @@ def scooped(room: jax.Array | None, account: Lost, taken: jax.Array) -> tuple[ja
     if room is None or account is None:
         return 0.0, account
     wanted, left = total(taken), jnp.maximum(room - (account[0] + account[1]), 0)
-    share = jnp.where(wanted > left, left / jnp.where(wanted > 0, wanted, 1), 1)
+    full = wanted > left
+    share = jnp.where(full, jnp.where(full, left, 0) / jnp.where(full, wanted, 1), 1)
     into = truncate(taken * spread(share, taken))
     return into, counted(account, into)
 

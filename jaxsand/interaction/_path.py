@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxsand.autodiff.while_loop import Tree
@@ -128,9 +129,7 @@ def travelled(
         raise ValueError(
             "path: got heights, but this push keeps its tool at one depth; give SteppedPush(), or x and y alone"
         )
-    # Beyond this the floats cannot tell on which side of the map a point lies.
-    farthest = scene.grid.spacing * 2.0 ** (jnp.finfo(path.dtype).nmant + 8)
-    usable = jnp.all(jnp.abs(path) < farthest) & makes_sense(scene.tool) & ~jnp.any(upright(path))
+    usable = jnp.all(jnp.abs(path) < farthest(scene, path.dtype)) & makes_sense(scene.tool) & ~jnp.any(upright(path))
     path = jnp.where(usable, path, 0)
     path, heights = path[:, :2], path[:, 2:]
     if isinstance(scene.tool, NoTool):
@@ -186,6 +185,11 @@ def travelled(
     broken = broken | spoiled(intact, marked) | ~sound(bed) | ~usable
     scooped = jax.tree.map(lambda count: count * flow.quantum, state.scooped)
     return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames, scooped
+
+
+def farthest(scene: Scene, dtype: DTypeLike) -> jax.Array:
+    """The distance (m) from which on floats cannot tell on which side of the map a point lies."""
+    return jnp.asarray(scene.grid.spacing * 2.0 ** (jnp.finfo(dtype).nmant + 8))
 
 
 def _untouched(height: jax.Array, path: jax.Array, usable: jax.Array, record: Record | None) -> tuple[Pushed, Tree]:

@@ -31,7 +31,7 @@ from jaxsand.interaction._block import SPARE, Block, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._leg import Steps, chunk, moved, way_of
 from jaxsand.interaction._lowering import Lower
-from jaxsand.interaction._path import Pushed, Record, State, along_legs, travelled
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, travelled, upright
 from jaxsand.interaction._turning import Turn
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.scene.scene import Scene
@@ -68,16 +68,21 @@ def scoop_along(
     """Moves a bucket's edge along `path` (m); what it cuts goes into the bucket, up to a sum of heights of `room` (m).
 
     The scene's tool is a blade as wide as the edge, a cell thick at most. It is moved such that its rear starts at path[0]
-    and its front ends at path[-1], so that what it cuts lies between the path's ends.
+    and its front ends at path[-1], so that what it cuts lies between the path's ends. First and last legs shorter than half
+    a cell are cut a little beyond their ends. Every leg keeps some of its length, and thereby its heading.
 
     Returns the map, and the account (low, high) of the sum of heights (m) in the bucket.
     """
-    first, last = path[1] - path[0], path[-1] - path[-2]
-    lengths = jnp.stack([_length(first[:2]), _length(last[:2])])
-    thick = jnp.minimum(jnp.min(lengths), scene.grid.spacing)
-    parts = thick / 2 / jnp.where(lengths > 0, lengths, 1)
-    path = path.at[0].add(parts[0] * first).at[-1].add(-parts[1] * last)
-    scene = replace(scene, tool=replace(scene.tool, thickness=thick))
+    runs = path[1:] - path[:-1]
+    lengths = jax.vmap(_length)(runs[:, :2])
+    dx = scene.grid.spacing
+    thick = jnp.clip(_KEEPS * jnp.sum(lengths), 1e-6 * dx, dx)
+    ends = lengths[jnp.array([0, -1])]
+    most = ends / 2 if path.shape[0] == 2 else ends
+    parts = jnp.minimum(thick / 2, _KEEPS * most) / jnp.where(ends > 0, ends, 1)
+    moved = path.at[0].add(parts[0] * runs[0]).at[-1].add(-parts[1] * runs[-1])
+    path = jnp.where(jnp.any(upright(path)), jnp.nan, moved)
+    scene = replace(scene, tool=replace(scene.tool, thickness=thick, depth=jnp.max(-path[:, 2])))
     leg = partial(_leg, scene, push, bring_to_rest, path.shape[0] > 2)
     pushed, _, scooped = travelled(scene, height, path, push.rate, leg, rises=True, room=room)
     assert scooped is not None
@@ -163,6 +168,7 @@ def _far(width: Length, thickness: Length) -> Length:
     return ((width + 1) ** 2 + (thickness + 1) ** 2) ** 0.5 / 2 + 1
 
 
+_KEEPS = 0.98  # of its length a leg of a bucket's edge loses less than that to the edge's thickness
 _TOLERANCE = 1e-3  # a window's tolerance: the slope above repose that settling leaves by default
 _LEAST = 1.5  # a map's width over a window's, from which on the window saves work
 

@@ -10,11 +10,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxsand.interaction._path import heading
+from jaxsand.interaction._path import farthest, heading
 from jaxsand.interaction.blade_stepped import scoop_along
 from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured
 from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, lifted, ready
@@ -25,6 +26,7 @@ from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
 from jaxsand.scene.masked import POINTS
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import Blade, Bucket, Pose
+from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
 
 
@@ -128,9 +130,9 @@ def scoop(
     path = _path(path, height.dtype, 2)
     if path.shape[1] == 2:
         path = jnp.concatenate([path, jnp.full_like(path[:, :1], -jnp.asarray(bucket.depth, path.dtype))], 1)
-    held = _load(load, height.dtype)
+    held = _one_load(load, height.dtype)
     capacity = jnp.asarray(bucket.capacity, height.dtype)
-    return as_needed(partial(_scooped, height, path, held, capacity, rules), edge, rules, (height, path, held))
+    return as_needed(partial(_scooped, height, path, held, capacity, rules), edge, rules, (height, path, held, capacity))
 
 
 def dump(
@@ -181,7 +183,7 @@ def dump(
     scheme, stop = check_rule(scene, scheme, stop)
     scene, height = fit(scene, height)
     path = _path(path, height.dtype, 1)[:, :2]
-    held = _load(load, height.dtype)
+    held = _one_load(load, height.dtype)
     pour = None if amount is None else as_array("amount", amount, height.dtype)
     return _dumped(scene, height, path, held, pour, cast((scheme, stop), height.dtype))
 
@@ -197,7 +199,7 @@ def load_volume(scene: Scene, load: Load | None) -> Float[Array, "*batch"]:
     """
     check_scene(scene)
     dx = jnp.asarray(scene.grid.spacing)
-    held = _load(load, jnp.result_type(dx) if load is None else jnp.result_type(load.high))
+    held = _load(load, None if load is not None else jnp.result_type(dx))
     return (held.high + held.low) * dx.astype(held.high.dtype) ** 2
 
 
@@ -219,12 +221,28 @@ def _path(path: ArrayLike, dtype: jax.typing.DTypeLike, least: int) -> jax.Array
     return path
 
 
-def _load(load: Load | None, dtype: jax.typing.DTypeLike) -> Load:
+def _load(load: Load | None, dtype: jax.typing.DTypeLike | None) -> Load:
+    """The load in a dtype, or its own, rounded no more than two floats are; ValueError, with the field, if it is none."""
     if load is None:
         return Load(jnp.zeros((), dtype), jnp.zeros((), dtype))
     if not isinstance(load, Load):
         raise ValueError(f"load: got {type(load).__name__}; give the .load of what scoop or dump returned, or None")
-    return Load(jnp.asarray(load.high, dtype), jnp.asarray(load.low, dtype))
+    high, low = as_array("load.high", load.high), as_array("load.low", load.low)
+    dtype = dtype or high.dtype
+    rounded = high.astype(dtype)
+    return Load(rounded, (high - rounded.astype(high.dtype) + low.astype(high.dtype)).astype(dtype))
+
+
+def _one_load(load: Load | None, dtype: jax.typing.DTypeLike) -> Load:
+    """`_load` of a single map: two numbers of which the sum is finite and 0 or more; what is being traced passes."""
+    held = _load(load, dtype)
+    for name, part in (("load.high", held.high), ("load.low", held.low)):
+        if part.ndim:
+            raise ValueError(f"{name}: got shape {list(part.shape)}; give the load of one map, and use jax.vmap for many")
+    known = concrete(held.high)
+    if known is not None and not (np.isfinite(known) and known >= 0):
+        raise ValueError(f"load.high: got {known}; it must be finite and 0 or more: give the .load of what scoop returned")
+    return held
 
 
 def _added(load: Load, account: tuple[jax.Array, jax.Array], sign: float) -> Load:
@@ -247,11 +265,14 @@ def _scooped(
 ) -> Loaded:
     push, scheme, stop = rules
     assert isinstance(push, SteppedPush)
-    room = jnp.maximum(capacity / scene.grid.spacing**2 - (load.high + load.low), 0)
+    there = load.high + load.low
+    sound = jnp.isfinite(there) & (there >= 0) & (capacity > 0)
+    room = jnp.where(sound, jnp.maximum(capacity / scene.grid.spacing**2 - there, 0), 0)
+    path = jnp.where(sound, path, jnp.nan)  # which leaves the map as it is, and is told of
     pushed, account = scoop_along(scene, height, path, push, room)
     edge = replace(pushed, pose=replace(pushed.pose, x=path[-1, 0], y=path[-1, 1]))
     shaped = lifted(edge, relax(scene, pushed.height, scheme, stop, window))
-    return Loaded(**vars(shaped), load=_added(load, account, 1))
+    return Loaded(**vars(shaped), load=jax.tree.map(partial(jnp.where, sound), _added(load, account, 1), load))
 
 
 @jax.jit
@@ -267,10 +288,15 @@ def _dumped(
     assert isinstance(tool, Bucket)
     there = load.high + load.low
     asked = there if amount is None else amount / scene.grid.spacing**2
-    sound = jnp.all(jnp.isfinite(path)) & jnp.isfinite(asked) & (asked >= 0) & jnp.isfinite(there)
+    width = jnp.asarray(tool.width)
+    sound = jnp.all(jnp.abs(path) < farthest(scene, path.dtype)) & jnp.isfinite(width)
+    sound = sound & jnp.isfinite(asked) & (asked >= 0) & jnp.isfinite(there) & (there >= 0)
     path = jnp.where(sound, path, 0)
     asked, held = jnp.where(sound, asked, 0), jax.tree.map(lambda x: jnp.where(sound, x, 0), load)
-    weights = point_weights(scene, path[0]) if path.shape[0] == 1 else path_weights(scene, path, jnp.asarray(tool.width))
+    weights = point_weights(scene, path[0])
+    if path.shape[0] > 1:  # where the path has no length, it is a point
+        spread = path_weights(scene, path, jnp.where(sound, width, 0))
+        weights = jnp.where(jnp.any(path[1:] != path[:-1]), spread, weights)
     after, account, missed = poured(scene, height, weights, asked, (held.low, held.high))
     settled = relax(scene, after, *rules)
     outcome = settled.outcome | missed | said(Outcome.NOT_FINITE, ~sound)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -143,29 +144,45 @@ def poured(
 
     All of `held` (low, high), and no more, is put down if `amount` is as much or more.
 
-    Returns the map, the sum of heights that was put down as an account (m), and NOT_POURED if it was less than `amount`.
+    Returns the map, the sum of heights that was put down as an account (m), and NOT_POURED if it was less than `amount`, or
+    NOT_FINITE, and the map as it was, if a number is not finite or below 0.
     """
     bed = prepare(scene)
     marked, _ = mark(scene, height)
-    weights = jnp.where(jnp.isnan(marked), 0, jnp.maximum(weights, 0))
-    whole = jnp.sum(weights)
-    asked = jnp.maximum(amount, 0)
     there = held[0] + held[1]
+    sound = jnp.isfinite(there) & (there >= 0) & jnp.isfinite(amount) & (amount >= 0) & jnp.all(jnp.isfinite(weights))
+    weights = jnp.where(sound & ~jnp.isnan(marked), jnp.maximum(weights, 0), 0)
+    most = jnp.max(weights)
+    weights = weights / jnp.where(most > 0, most, 1)
+    whole = jnp.sum(jnp.sum(weights, axis=0), axis=0)
+    asked, there = jnp.where(sound, amount, 0), jnp.where(sound, there, 0)
     given = jnp.where(whole > 0, jnp.minimum(asked, there), 0)
     share = weights / jnp.where(whole > 0, whole, 1)
     size = quantum(jnp.maximum(largest(marked), bed.elsewhere) + jnp.max(share) * given)
     put = truncate(share * given / size)
     zero = jnp.zeros_like(given)
-    low, high = counted((zero, zero), put)
-    # What rounding left over goes to the cell with the largest share: of all that is held to the last quantum.
-    all_of_it = asked >= there
-    rest = jnp.where(all_of_it, (held[1] / size - high) + (held[0] / size - low), given / size - (low + high))
-    rest = jnp.where(whole > 0, jnp.floor(jax.lax.stop_gradient(rest)), 0)
-    cell = jnp.argmax(share.ravel())
-    put = put.ravel().at[cell].add(rest).reshape(put.shape)
-    low = low + rest
+    account = counted((zero, zero), put)
+
+    def rest() -> jax.Array:
+        """What is yet to be put down, in whole quanta; of all that is held to the last one."""
+        low, high = account
+        of_all = (held[1] / size - high) + (held[0] / size - low)
+        left = jnp.where(asked >= there, of_all, given / size - (low + high))
+        return jnp.where(whole > 0, jnp.floor(lax.stop_gradient(left)), 0)
+
+    # Rounding leaves some: first in proportion to the weights, then a quantum to a cell, then, if need be, to one cell.
+    more = jnp.trunc(lax.stop_gradient(share) * rest())
+    put, account = put + more, counted(account, more)
+    left = rest()
+    number = jnp.cumsum((share > 0).ravel()).reshape(share.shape)
+    more = jnp.where((share > 0) & (number <= jnp.abs(left)), jnp.sign(left), 0)
+    put, account = put + more, counted(account, more)
+    last = rest()
+    put = put.ravel().at[jnp.argmax(share.ravel())].add(last).reshape(put.shape)
+    low, high = account
     missed = said(Outcome.NOT_POURED, (asked > there * (1 + 1e-6)) | ((whole <= 0) & (asked > 0)))
-    return unmark(marked + sign * (put * size), height), (low * size, high * size), missed
+    missed = missed | said(Outcome.NOT_FINITE, ~sound)
+    return unmark(marked + sign * (put * size), height), ((low + last) * size, high * size), missed
 
 
 def point_weights(scene: Scene, point: Float[Array, "2"]) -> Float[Array, "H W"]:

@@ -19,7 +19,6 @@ from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import Scene
 
 Lost = tuple[jax.Array, jax.Array] | None
-_COARSE = 4096.0  # quanta that an account keeps in its coarse part
 
 
 @jax.tree_util.register_dataclass
@@ -140,7 +139,7 @@ def lose(quantum: jax.Array, lost: tuple[jax.Array, jax.Array], amount: jax.Arra
     """
     low, high = lost
     low = low + amount
-    coarse = quantum * _COARSE
+    coarse = quantum * 4096
     carry = truncate(low / coarse) * coarse
     return low - carry, high + carry
 
@@ -148,17 +147,22 @@ def lose(quantum: jax.Array, lost: tuple[jax.Array, jax.Array], amount: jax.Arra
 def counted(account: tuple[jax.Array, jax.Array], amount: Float[Array, "m n ..."]) -> tuple[jax.Array, jax.Array]:
     """Adds the sum of a map of whole quanta to an account (low, high), a pair of numbers of quanta whose sum is exact.
 
-    The cells are summed as whole numbers, coarse and fine parts apart. The derivative is that of the sum of floats.
+    The cells are summed as whole numbers in digits of 11 bits, rows first, so that no sum overflows on maps of up to 2^18
+    columns. The account is exact up to 2^46 quanta in float32. The derivative is that of the sum of floats.
     """
     low, high = account
-    whole = jnp.int64 if amount.dtype == jnp.float64 else jnp.int32
-    total = jnp.sum(amount, axis=(0, 1))
+    total = jnp.sum(jnp.sum(amount, axis=0), axis=0)
     exact = lax.stop_gradient(amount)
-    parts = jnp.trunc(exact / _COARSE)
-    coarse, fine = (jnp.sum(x.astype(whole), axis=(0, 1)).astype(amount.dtype) for x in (parts, exact - _COARSE * parts))
-    low = low + fine + (total - lax.stop_gradient(total))
-    carry = lax.stop_gradient(jnp.trunc(low / _COARSE))
-    return low - _COARSE * carry, high + _COARSE * (coarse + carry)
+    whole = jnp.int64 if amount.dtype == jnp.float64 else jnp.int32
+    coarse = jnp.trunc(exact / 2048)
+    second, first = (jnp.sum(x.astype(whole), axis=1) for x in (coarse, exact - 2048 * coarse))
+    second, first = second + (first >> 11), first & 2047
+    third, second, first = (jnp.sum(x, axis=0) for x in (second >> 11, second & 2047, first))
+    second, first = second + (first >> 11), first & 2047
+    third, second = third + (second >> 11), second & 2047
+    low = low + (second * 2048 + first).astype(low.dtype) + (total - lax.stop_gradient(total))
+    carry = lax.stop_gradient(jnp.floor(low / 2**22))
+    return low - 2**22 * carry, high + 2**22 * (third.astype(high.dtype) + carry)
 
 
 def nothing_lost(bed: Bed, height: jax.Array) -> Lost:

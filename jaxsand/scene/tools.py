@@ -292,7 +292,9 @@ def extent(tool: Blade | Wheel, heights: Float[Array, "n k"]) -> Scalar:
 
     `heights` are those of its lowest point on its way [n, 1], or [n, 0] if it stays at its own depth.
     """
-    deep = jnp.max(jnp.maximum(-heights, 0)) if heights.size else jnp.abs(lowest(tool))
+    deep = jnp.abs(lowest(tool))
+    if heights.size:
+        deep = jnp.maximum(deep, jnp.max(-heights))
     return jnp.maximum(tool.radius, deep) if isinstance(tool, Wheel) else deep
 
 

@@ -35,6 +35,24 @@ def test_a_scoop_holds_its_width_times_its_way_times_its_depth(heights, mean):
     assert np.asarray(out.height).max() < 1e-3  # nothing is pushed ahead while there is room
 
 
+@pytest.mark.parametrize("last", [0.5, 0.1, 0.0])
+def test_short_legs_at_the_ends_change_little(last):
+    """The edge is a cell thick, however short a leg is; it cuts up to half a cell beyond a shorter one."""
+    path = np.array([[0.06, 0.12, -0.01], [0.16 - last * DX, 0.12, -0.01], [0.16, 0.12, -0.01]])
+    for way in (path, path[::-1] * [1, 1, 1]):
+        load = held(SAND, js.scoop(SAND, LEVEL, way).load)
+        assert 6e-5 * (1 - 1e-3) < load < 6e-5 * 1.06
+
+
+def test_a_scoop_of_a_cell_keeps_its_heading():
+    for end, z in (([0.101, 0.133], -0.006), ([0.123, 0.126], -0.008), ([0.101, 0.127], -0.01)):
+        out = js.scoop(SAND, LEVEL, [[0.101, 0.123, -0.01], [*end, z]])
+        js.check(out)
+        run = np.subtract(end, [0.101, 0.123])
+        assert float(out.pose.cos) == pytest.approx(run[0] / np.hypot(*run), abs=1e-6)
+        assert held(SAND, out.load) == pytest.approx(0.06 * np.hypot(*run) * (0.01 - z) / 2, rel=0.1)
+
+
 def test_a_full_bucket_pushes_the_rest_ahead():
     small = js.make_scene((N, N), DX, ANGLE, tool=js.Bucket(0.06, 0.04, 2e-5))
     out = js.scoop(small, LEVEL, [[0.06, 0.12, -0.01], [0.16, 0.12, -0.01]])
@@ -119,6 +137,55 @@ def test_more_than_there_is_and_off_the_map_are_outcomes():
     assert held(SAND, lost.load) == pytest.approx(1e-5)
 
 
+def test_loads_and_numbers_that_make_no_sense_are_told_of_and_change_nothing():
+    path = np.array([[0.06, 0.12, 0.0], [0.16, 0.12, -0.01]])
+    one, nothing = jnp.asarray(1.0), jnp.zeros(())
+    scooped = jax.jit(lambda high: js.scoop(SAND, ROUGH, path, js.Load(high, nothing)))
+    dumped = jax.jit(lambda high: js.dump(SAND, ROUGH, path, js.Load(high, nothing)))
+    poured = jax.jit(lambda volume, x: js.deposit(SAND, ROUGH, jnp.stack([x, x]), volume))
+    for bad in (math.nan, math.inf, -1.0):
+        for out in (scooped(bad), dumped(bad), poured(bad, 0.1)):
+            assert js.Outcome.NOT_FINITE in js.Outcome(int(out.outcome))
+            assert np.array_equal(out.height, ROUGH)
+    assert js.Outcome.NOT_FINITE in js.Outcome(int(poured(1e-5, math.nan).outcome))
+    far = js.dump(SAND, ROUGH, [[3e38, 0.12], [-3e38, 0.12]], js.Load(one, nothing))
+    assert js.Outcome.NOT_FINITE in js.Outcome(int(far.outcome))
+    assert float(far.load.high) == 1.0
+
+
+def test_two_equal_points_are_one():
+    load = js.Load(jnp.asarray(0.1), jnp.zeros(()))
+    one, two = (js.dump(SAND, LEVEL, [[0.1, 0.1]] * n, load) for n in (1, 2))
+    assert np.abs(one.height - two.height).max() < 1e-12
+
+
+def test_a_large_footprint_is_even_in_float32():
+    """Sums of a million cells of 2^23 quanta each overflow neither integers nor floats; what rounding leaves is spread."""
+    shape = (520, 600)
+    scene = js.make_scene(shape, DX, ANGLE)
+    slab = np.asarray(
+        js.deposit(scene, np.zeros(shape, np.float32), np.full(shape, 0.1, np.float32), 3.12e5 * DX**2 * 0.001).height
+    )
+    assert slab.dtype == np.float32
+    assert np.abs(slab - 0.001).max() < 1e-6
+    assert slab.sum(dtype=float) == pytest.approx(312.0, rel=1e-6)
+
+
+def test_a_float64_load_is_not_rounded_by_float32_heights():
+    load = js.Load(jnp.asarray(0.123456789012), jnp.zeros(()))
+    left = js.dump(SAND, np.zeros((N, N), np.float32), [[0.1, 0.1]], load, amount=0.0).load
+    assert left.high.dtype == jnp.float32
+    assert float(left.high) + float(left.low) == pytest.approx(0.123456789012, rel=1e-13)
+
+
+def test_vmap_over_the_capacity():
+    def high(capacity):
+        scene = js.make_scene((N, N), DX, ANGLE, tool=js.Bucket(0.06, 0.04, capacity))
+        return js.scoop(scene, LEVEL, [[0.06, 0.12, -0.01], [0.16, 0.12, -0.01]]).load.high
+
+    assert jax.vmap(high)(np.array([1e-6, 2e-5, 1e30])) * DX**2 == pytest.approx([1e-6, 2e-5, 6e-5], rel=1e-9)
+
+
 def test_vmap_equals_a_loop():
     paths = np.array([[[0.06, 0.12, 0.0], [0.16, 0.1, -0.01]], [[0.2, 0.03, -0.01], [0.05, 0.18, -0.002]]])
     maps = jax.vmap(lambda h, p: js.scoop(SAND, h, p))(np.stack([ROUGH, LEVEL]), paths)
@@ -188,6 +255,10 @@ def test_bad_input_is_named():
         (lambda: js.scoop(js.make_scene((8, 8), DX), LEVEL[:8, :8], path), r"scene\.tool: got NoTool; give make_scene"),
         (lambda: js.scoop(SAND, LEVEL, path[:1]), r"path: got shape \[1, 3\]; give at least two points"),
         (lambda: js.scoop(SAND, LEVEL, path, 1e-5), r"load: got float; give the \.load"),
+        (lambda: js.load_volume(SAND, 3.0), r"load: got float; give the \.load"),
+        (lambda: js.dump(SAND, LEVEL, path, js.Load(np.zeros(3), np.zeros(3))), r"load\.high: got shape \[3\]; .*jax\.vmap"),
+        (lambda: js.dump(SAND, LEVEL, path, js.Load(-1.0, 0.0)), r"load\.high: got -1\.0; it must be finite and 0 or more"),
+        (lambda: js.dump(SAND, LEVEL, path, js.Load(object(), 0.0)), r"load\.high: got object, no array of numbers"),
         (lambda: js.scoop(SAND, LEVEL, path, push=js.SwathPush()), r"push: got SwathPush.*SteppedPush"),
         (lambda: js.step(SAND, LEVEL, path.ravel()), r"push: got SteppedPush for a Bucket; .*js\.scoop"),
         (
