@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxsand.bench.timing import seconds_of
+from jaxsand.goals.usual import SHAPE, SPACING
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.rule import PushRule
 from jaxsand.interaction.simulate import step
@@ -22,9 +23,8 @@ from jaxsand.terramechanics.finer import OneGrid, TwoGrids
 NOISE = 6e-4
 """Standard deviation (m) of the white noise in the heights after."""
 
-_SHAPE, _SPACING = (32, 32), 0.01
 _STROKE = np.array([0.08, 0.12, 0.24, 0.2], np.float32)
-_LEVEL = np.zeros(_SHAPE, np.float32)
+_LEVEL = np.zeros(SHAPE, np.float32)
 _ANGLES = (20.0, 40.0)  # degrees, between which every seed has its own
 _EXACT = 29.0  # degrees: the cone's angle
 _PARTS = 16  # of a cell's side, for means over cells
@@ -35,7 +35,7 @@ def bench_calibrate(tell: Tell = quiet, seeds: int = 50) -> list[dict[str, Any]]
     """For three experiments in the simulator's own sand: the rms and the largest error of the angle of repose, and the rms
     of the noise's standard errors (at the optimum the Cramer-Rao bound), in degrees, over so many angles and noises.
     Strokes are swaths: the fast push."""
-    y, x = (np.indices(_SHAPE) + 0.5) * _SPACING
+    y, x = (np.indices(SHAPE) + 0.5) * SPACING
     column = np.where(np.hypot(x - 0.16, y - 0.16) < 0.06, 0.06, 0).astype(np.float32)
     experiments: dict[str, tuple[Blade | None, np.ndarray]] = {
         "a column collapses": (None, column),
@@ -68,14 +68,14 @@ def bench_cone(tell: Tell = quiet, seeds: int = 100) -> list[dict[str, Any]]:
     grid's error; and the median seconds of a call with the grid's part and without, compiled before."""
     before, after = cone(_EXACT)
     trials = [
-        Trial(before, after + np.random.default_rng(seed).normal(0, NOISE, _SHAPE).astype(np.float32))
+        Trial(before, after + np.random.default_rng(seed).normal(0, NOISE, SHAPE).astype(np.float32))
         for seed in range(seeds)
     ]
     neighbourhoods: tuple[Neighbours, ...] = (4, 8, "isotropic")
     rows = []
     for neighbours in neighbourhoods:
         tell(f"cone, {neighbours} neighbours")
-        scene = make_scene(_SHAPE, _SPACING, math.radians(26), neighbours)
+        scene = make_scene(SHAPE, SPACING, math.radians(26), neighbours)
         found = [_told(scene, trial) for trial in trials]
         value, noise, grid, error, sand, sand_error = np.degrees(found).T
         rows.append(
@@ -103,11 +103,11 @@ def cone(degrees: float, radius: float = 0.06, height: float = 0.06) -> tuple[np
     """A cylinder, and the cone to which it collapses, as means over cells (m): the toe lies at (3 R^2 H / mu)^(1/3)."""
     mu = math.tan(math.radians(degrees))
     toe = (3 * radius**2 * height / mu) ** (1 / 3)
-    n = _SHAPE[0] * _PARTS
-    place = ((np.arange(n) + 0.5) / n - 0.5) * _SHAPE[0] * _SPACING
+    n = SHAPE[0] * _PARTS
+    place = ((np.arange(n) + 0.5) / n - 0.5) * SHAPE[0] * SPACING
     away = np.hypot(place[:, None], place[None, :])
     maps = (np.where(away < radius, height, 0), np.maximum(mu * (toe - away), 0))
-    before, after = (m.reshape(_SHAPE[0], _PARTS, _SHAPE[1], _PARTS).mean((1, 3)).astype(np.float32) for m in maps)
+    before, after = (m.reshape(SHAPE[0], _PARTS, SHAPE[1], _PARTS).mean((1, 3)).astype(np.float32) for m in maps)
     return before, after
 
 
@@ -127,7 +127,7 @@ def _seconds(scene: Scene, trials: list[Trial], grid: TwoGrids | OneGrid) -> flo
 def _found(true: Scene, guess: Scene, before: np.ndarray, seed: int) -> tuple[float, float]:
     """The angle of repose found, and the noise's part of its standard error, in degrees."""
     stroke, push = (_STROKE, SwathPush()) if isinstance(true.tool, Blade) else (None, None)
-    after = np.asarray(_after(true, before, stroke, push)) + np.random.default_rng(seed).normal(0, NOISE, _SHAPE)
+    after = np.asarray(_after(true, before, stroke, push)) + np.random.default_rng(seed).normal(0, NOISE, SHAPE)
     trial = Trial(before, after.astype(np.float32), stroke)
     found = calibrate(guess, trial, free=_FREE, noise=NOISE, starts=3, push=push, grid=OneGrid())
     return math.degrees(found.values["repose_angle"]), math.degrees(found.noise_errors["repose_angle"])
@@ -138,4 +138,4 @@ def _after(scene: Scene, before: np.ndarray, stroke: np.ndarray | None, push: Pu
 
 
 def _sand(degrees: float, tool: Blade | None) -> Scene:
-    return make_scene(_SHAPE, _SPACING, math.radians(degrees), tool=tool)
+    return make_scene(SHAPE, SPACING, math.radians(degrees), tool=tool)

@@ -20,6 +20,7 @@ from jax import lax
 
 from jaxsand.bench.timing import race
 from jaxsand.goals.surfaces import rough_surface
+from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.batched import act_batch, step_batch, value_and_grad_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.blade_stepped import push_along, with_near
@@ -89,7 +90,7 @@ def push_precision(batch: int = 16, tell: Tell = quiet) -> list[dict[str, Any]]:
     """
     rows: list[dict[str, Any]] = []
     with jax.enable_x64(True):
-        scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
+        scene = usual_scene()
         strokes = np.tile(np.asarray(random_strokes(batch), float), (3, 1))
         starts = np.concatenate(list(surfaces(scene, batch).values()))
         tell("limit: proximal steps, sub-steps 1/256 and 1/128")
@@ -118,7 +119,7 @@ def push_precision(batch: int = 16, tell: Tell = quiet) -> list[dict[str, Any]]:
 
 def push_speed(batch: int, tell: Tell = quiet) -> list[dict[str, Any]]:
     """Random pushes of the default blade on level sand of 32 x 32 cells: pushes a second, the ways taking turns."""
-    scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
+    scene = usual_scene()
     level, strokes = jnp.zeros((batch, 32, 32), jnp.float32), random_strokes(batch)
     vmapped = jax.jit(jax.vmap(partial(step, scene)))
     few = strokes[:16]
@@ -194,7 +195,7 @@ def push_continuity(many: int = 1024, tell: Tell = quiet) -> list[dict[str, Any]
     """How far what a stroke leaves moves with the stroke: the largest change of a height over that of the stroke, as
     quantiles over random strokes in float64."""
     with jax.enable_x64(True):
-        scene = make_scene((32, 32), 0.01, _ANGLE, tool=Blade())
+        scene = usual_scene()
         strokes = np.asarray(random_strokes(many), float)
         moves = np.random.default_rng(0).normal(size=strokes.shape)
         moves /= np.abs(moves).max(1, keepdims=True)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.goals.metrics import volume_error
+from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.simulate import rollout
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch, steepest_slope
@@ -19,7 +20,6 @@ from jaxsand.scene.boundaries import Draining, Walls
 from jaxsand.scene.grid import Neighbours, links
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import make_scene
-from jaxsand.scene.tools import Blade
 
 VOLUME = {"float16": 2e-3, "float32": 1e-6, "float64": 1e-12}  # the largest volume error
 QUANTA = 64  # sand that the floats stop is steeper by at most so many quanta to a spacing
@@ -222,7 +222,7 @@ def _column(side: int) -> np.ndarray:
 def _pushing(pushes: int, tell: Tell, at_once: int = 1000) -> dict[str, Any]:
     """Random pushes of the default blade from anywhere to anywhere on 32 x 32 cells, at first level, in float32."""
     began = time.perf_counter()
-    scene = make_scene((32, 32), _DX, tool=Blade())
+    scene = usual_scene()
     at_once = min(at_once, pushes)
     height = jnp.zeros((32, 32), jnp.float32)
     outcome, drift, size, residual, sweeps = Outcome(0), 0.0, 0.0, 0.0, 0

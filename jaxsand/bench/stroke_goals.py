@@ -9,6 +9,7 @@ import numpy as np
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics
 from jaxsand.goals.surfaces import terrain_surface
+from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import rollout
 from jaxsand.planning.stroke_loss import SandLoss
@@ -16,14 +17,6 @@ from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
-
-CELLS, SPACING = 32, 0.01
-"""Cells along a side of the map that glyphs are judged on, and their size (m)."""
-
-
-def usual_scene() -> Scene:
-    """32 x 32 cells of 0.01 m, 29 degrees, the default blade: the scene in which glyphs are judged."""
-    return make_scene((CELLS, CELLS), SPACING, tool=Blade())
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,7 @@ def turned_letters(names: str = string.ascii_uppercase, degrees: float = 30.0) -
 
 def letters_on_rough_sand(names: str = string.ascii_uppercase, relief: float = 0.01) -> list[StrokeGoal]:
     """Letters pushed into terrain of a height range `relief` (m)."""
-    scene = make_scene((CELLS, CELLS), SPACING)
+    scene = make_scene(SHAPE, SPACING)
     rested = settle(scene, terrain_surface(scene.grid.shape, relief).astype(np.float32), stop=UntilStill(bound=200_000))
     check(rested)
     rough = np.asarray(rested.height)

@@ -26,11 +26,11 @@ from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.envs.onsand import OnSand, SandParams, SandState
 from jaxsand.envs.pushing import ByLength, Together
 from jaxsand.envs.spaces import Box, Dict, Discrete
+from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.blade_stepped import with_near
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene
-from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Whole, Window
 
 __all__ = [
@@ -65,7 +65,7 @@ __all__ = [
     "pool_of",
 ]
 
-_SHAPE, _SPACING, _WINDOW = (32, 32), 0.01, (12, 12)
+_WINDOW = (12, 12)
 
 
 @overload
@@ -173,7 +173,7 @@ def _multi(
     check_whole("seed", seed, 0)
     if scene is None:
         window = Window(_WINDOW) if isinstance(env.push, SteppedPush) else Whole()
-        scene = make_scene(_SHAPE, _SPACING, tool=Blade(), window=window)
+        scene = usual_scene(window=window)
     check_scene(scene)
     scene = with_near(scene)
     if isinstance(goals, LevelGoals | RoughGoals):

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsand.bench.stroke_goals import usual_scene
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams, StrokeState
+from jaxsand.goals.usual import usual_scene
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
 from train.ddpg.acting import Acts

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsand.bench.stroke_goals import CELLS, SPACING, usual_scene
 from jaxsand.goals.metrics import GLYPH_SQUARE
+from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.planning.stroke_loss import pushed
 from jaxsand.relaxation.settling import steepest_slope
 from train.imitation.hindsight import Hindsight, _labels, _pairs, _turned
@@ -73,7 +73,7 @@ def test_its_own_way_leaves_what_it_did_not_do():
     generator = rng()
     strokes, numbers = random_plans(generator, 6)
     strokes = anywhere(generator, strokes)
-    level = np.zeros((6, CELLS, CELLS), np.float32)
+    level = np.zeros((6, SHAPE[0], SHAPE[0]), np.float32)
     goals = lessons(SCENE, rng(), 6, level).goal[:6]
 
     def last(goal, current):
@@ -93,7 +93,7 @@ def test_its_own_way_leaves_what_it_did_not_do():
 
 
 def test_turned_lessons_are_as_true():
-    lesson = lessons(SCENE, rng(), 4, np.zeros((4, CELLS, CELLS), np.float32))
+    lesson = lessons(SCENE, rng(), 4, np.zeros((4, SHAPE[0], SHAPE[0]), np.float32))
     depth = float(SCENE.tool.depth)
     goal, current, due, counts = _turned(lesson, np.arange(4), rng(5), depth)
     assert not np.allclose(goal, lesson.goal[:4] / depth)
@@ -118,7 +118,7 @@ def test_pairs_are_labelled_by_the_strokes_due():
 
 def test_sand_to_practise_on_is_at_rest_and_varied():
     scene = other_scene(rng(3))
-    assert scene.grid.shape == (CELLS, CELLS)
+    assert scene.grid.shape == SHAPE
     maps = starts(scene, rng(4), 16, rough=0.5)
     rough = np.ptp(maps, axis=(1, 2)) > 0
     assert 3 <= rough.sum() <= 13

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsand.bench.stroke_goals import CELLS
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
+from jaxsand.goals.usual import SHAPE
 from jaxsand.scene.scene import Scene, blade_of
 from train.ddpg.networks import Actor, Critic
 from train.replay.her import Observation
@@ -54,8 +54,8 @@ class Acts:
         Raises:
           ValueError: for a scene of another size than the training's, or without a blade.
         """
-        if scene.grid.shape != (CELLS, CELLS):
-            raise ValueError(f"scene.grid.shape: got {scene.grid.shape}; this policy only knows ({CELLS}, {CELLS})")
+        if scene.grid.shape != (SHAPE[0], SHAPE[0]):
+            raise ValueError(f"scene.grid.shape: got {scene.grid.shape}; this policy only knows ({SHAPE[0]}, {SHAPE[0]})")
         depth = float(blade_of(scene).depth)
         maps = {name: jnp.asarray(x, jnp.float32) / depth for name, x in (("goal", goal), ("current", current))}
         tried = 1 if count == 1 else _TRIED * count

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.bench.stroke_goals import usual_scene
 from jaxsand.envs.library import RandomStrokes
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.goals import metrics
 from jaxsand.goals.layout import right
+from jaxsand.goals.usual import usual_scene
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.stroke_loss import pushed
 from jaxsand.scene.tools import Blade

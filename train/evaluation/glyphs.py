@@ -9,18 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsand.bench.stroke_goals import (
-    CELLS,
-    SPACING,
-    StrokeGoal,
-    letters,
-    letters_on_rough_sand,
-    stroke_goal,
-    turned_letters,
-)
+from jaxsand.bench.stroke_goals import StrokeGoal, letters, letters_on_rough_sand, stroke_goal, turned_letters
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics
-from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.goals.usual import usual_scene
+from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade
 from train.imitation.plans import random_plans
 
@@ -61,7 +54,7 @@ def _moved(scale: float, shift: float) -> list[StrokeGoal]:
 
 def _pushed_by(blade: Blade, degrees: float = 29.0) -> list[StrokeGoal]:
     """Letters pushed by another blade, or in sand of another angle of repose."""
-    scene: Scene = make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(degrees), tool=blade)
+    scene: Scene = usual_scene(repose_angle=math.radians(degrees), tool=blade)
     return [stroke_goal(name, metrics.place(goals.letter_strokes(name)), scene=scene) for name in string.ascii_uppercase]
 
 

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsand.bench.stroke_goals import CELLS, SPACING, usual_scene
 from jaxsand.goals.layout import right, strokes_right
 from jaxsand.goals.metrics import iou
+from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.learned.network import Params, StrokeNet, ends, judge, likeliest, spread
 from jaxsand.planning.learned.policy import Policy, in_batches
@@ -86,7 +86,7 @@ class Hindsight:
         return StrokeNet(self.widths, self.blocks)
 
     def init(self, seed: int) -> Progress:
-        maps = jnp.zeros((1, CELLS, CELLS))
+        maps = jnp.zeros((1, SHAPE[0], SHAPE[0]))
         params = jax.jit(self.net.init)(jax.random.key(seed), maps, maps, jnp.zeros((1, 1, 4)))
         return Progress(params, params, _optimiser().init(params), jnp.int32(0), jnp.int32(seed))
 
@@ -165,7 +165,7 @@ def _turned(lesson: Lessons, who: np.ndarray, rng: np.random.Generator, depth: f
     for axis in (0, 1):  # x, y
         flip = rng.random(len(who)) < 0.5
         goal, current = (np.where(flip[:, None, None], np.flip(x, 2 - axis), x) for x in (goal, current))
-        due[flip, ..., axis] = CELLS - due[flip, ..., axis]
+        due[flip, ..., axis] = SHAPE[0] - due[flip, ..., axis]
     swap = rng.random(len(who)) < 0.5
     goal, current = (np.where(swap[:, None, None], x.swapaxes(1, 2), x) for x in (goal, current))
     due = np.where(swap[:, None, None, None], due[..., ::-1], due)
@@ -187,7 +187,7 @@ def _pairs(key: jax.Array, due: jax.Array) -> jax.Array:
             due[:, :, ::-1].reshape(batch, count, 4),
             jnp.concatenate([due[:, :, 0], other], -1),
             mixed.reshape(batch, count, 4),
-            jnp.clip(moved.reshape(batch, 2 * count, 4), 0, CELLS),
+            jnp.clip(moved.reshape(batch, 2 * count, 4), 0, SHAPE[0]),
         ],
         1,
     )

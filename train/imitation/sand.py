@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from jaxsand.bench.stroke_goals import CELLS, SPACING
 from jaxsand.goals.surfaces import rough_surface
+from jaxsand.goals.usual import SHAPE, SPACING
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -17,7 +17,7 @@ _FEATURES = (1.0, 6.0)  # cells
 def other_scene(rng: np.random.Generator) -> Scene:
     """The usual scene with another blade (15 to 32 mm wide, 4.5 to 11 mm deep) and angle of repose (23 to 36 degrees)."""
     blade = Blade(width=rng.uniform(0.015, 0.032), thickness=0.015, depth=rng.uniform(0.0045, 0.011))
-    return make_scene((CELLS, CELLS), SPACING, repose_angle=math.radians(rng.uniform(23, 36)), tool=blade)
+    return make_scene(SHAPE, SPACING, repose_angle=math.radians(rng.uniform(23, 36)), tool=blade)
 
 
 def starts(scene: Scene, rng: np.random.Generator, count: int, rough: float) -> np.ndarray:

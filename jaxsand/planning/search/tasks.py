@@ -8,14 +8,13 @@ import numpy as np
 
 from jaxsand.goals import metrics, surfaces
 from jaxsand.goals.surfaces import rough_surface
+from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.interaction.outcome import check
 from jaxsand.planning.search.actions import Actions, Lattice, Steps
 from jaxsand.planning.search.rollouts import replay
 from jaxsand.relaxation.settling import settle
-from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade
-
-_SHAPE, _SPACING = (32, 32), 0.01
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def _ridge() -> SandTask:
     scene = _scene(Blade())
     x, y = _places()
     ridge = _at_rest(scene, 0.02 * ((np.abs(y - 0.19) < 0.015) & (np.abs(x - 0.16) < 0.11)))
-    level = np.zeros(_SHAPE, np.float32)
+    level = np.zeros(SHAPE, np.float32)
     trench = np.where(y < 0.145, replay(scene, level, [np.array([[0.06, 0.13], [0.26, 0.13]])]), 0)
     return SandTask("trench by a ridge", scene, ridge, ridge + trench - trench.mean(), 3, Lattice())
 
@@ -88,23 +87,23 @@ def _pit() -> SandTask:
 
 def _rough() -> SandTask:
     """A rough surface to be levelled."""
-    return _levelling("rough surface", rough_surface(np.random.default_rng(5), _SHAPE, 0.022, 1.6), 12)
+    return _levelling("rough surface", rough_surface(np.random.default_rng(5), SHAPE, 0.022, 1.6), 12)
 
 
 def _terrain() -> SandTask:
     """A patch of real terrain, of 3 cm relief, to be levelled."""
-    land = metrics.resample(surfaces.terrain()[100:200, 100:200], _SHAPE)
+    land = metrics.resample(surfaces.terrain()[100:200, 100:200], SHAPE)
     return _levelling("terrain", 0.03 * (land - np.median(land)) / (land.max() - land.min()), 12)
 
 
 def _stem() -> SandTask:
     """The letter T in one path, as it is written: along the bar, back to its middle, down the stem."""
     steps = Steps(cell=3, margin=1)
-    side = 1.15 * steps.cell * _SPACING
+    side = 1.15 * steps.cell * SPACING
     scene = _scene(Blade(side, side, 0.003))
     places = [(8, c) for c in range(1, 9)] + [(8, c) for c in range(7, 4, -1)] + [(r, 5) for r in range(7, 0, -1)]
-    path = (steps.margin + (np.array(places)[:, ::-1] + 0.5) * steps.cell) * _SPACING
-    level = np.zeros(_SHAPE, np.float32)
+    path = (steps.margin + (np.array(places)[:, ::-1] + 0.5) * steps.cell) * SPACING
+    level = np.zeros(SHAPE, np.float32)
     return SandTask("T in one path", scene, level, replay(scene, level, [path]), len(places) - 1, steps)
 
 
@@ -124,7 +123,7 @@ SAND_TASKS: dict[str, Callable[[], SandTask]] = {
 
 def _drawn(name: str, strokes: list[list[float]]) -> SandTask:
     """A task whose goal is what the given strokes leave on level sand, with berms."""
-    scene, level = _scene(Blade()), np.zeros(_SHAPE, np.float32)
+    scene, level = _scene(Blade()), np.zeros(SHAPE, np.float32)
     goal = replay(scene, level, [np.array(stroke).reshape(2, 2) for stroke in strokes])
     return SandTask(name, scene, level, goal, len(strokes), Lattice())
 
@@ -133,11 +132,11 @@ def _levelling(name: str, height: np.ndarray, strokes: int) -> SandTask:
     """A task to level a surface, with a blade 4 cm wide that scrapes at height 0."""
     scene = _scene(Blade(width=0.04, thickness=0.015, depth=0.0))
     height = _at_rest(scene, height)
-    return SandTask(name, scene, height - height.mean(), np.zeros(_SHAPE), strokes, Lattice())
+    return SandTask(name, scene, height - height.mean(), np.zeros(SHAPE), strokes, Lattice())
 
 
 def _scene(blade: Blade) -> Scene:
-    return make_scene(_SHAPE, _SPACING, tool=blade)
+    return usual_scene(tool=blade)
 
 
 def _at_rest(scene: Scene, height: np.ndarray) -> np.ndarray:
@@ -147,5 +146,5 @@ def _at_rest(scene: Scene, height: np.ndarray) -> np.ndarray:
 
 
 def _places() -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.meshgrid((np.arange(_SHAPE[1]) + 0.5) * _SPACING, (np.arange(_SHAPE[0]) + 0.5) * _SPACING)
+    x, y = np.meshgrid((np.arange(SHAPE[1]) + 0.5) * SPACING, (np.arange(SHAPE[0]) + 0.5) * SPACING)
     return x, y
