@@ -10,7 +10,7 @@ from jaxsand.relaxation import batching as batch
 
 from ..conftest import ANGLE
 
-pytestmark = pytest.mark.usefixtures("both_ways")
+pytestmark = pytest.mark.compiled  # a batch is its maps to the last bit, as users compile it
 
 SHAPE, DX = (16, 12), 0.01
 

@@ -65,7 +65,7 @@ BAD = {
     "two numbers for a stroke": (lambda: js.step(SAND, LEVEL, (1, 2)), r"stroke: got shape \[2\]; give x0, y0, x1, y1"),
     "one point for a path": (lambda: js.follow(SAND, LEVEL, [(0, 0)]), r"path: got shape \[1, 2\]; give at least two"),
     "a batch of paths": (lambda: js.follow(SAND, LEVEL, np.zeros((2, 3, 2))), r"path: got shape \[2, 3, 2\]; use jax\.vmap"),
-    "strokes for one": (lambda: js.rollout(SAND, LEVEL, STROKE), r"strokes: got shape \[4\]; give \[n, 4\]"),
+    "strokes for one": (lambda: js.rollout(SAND, LEVEL, STROKE), r"strokes: got shape \[4\]; give a row x0, y0, x1, y1 \[n, 4\]"),
     "strokes for another batch": (lambda: js.step_batch(SAND, LEVEL[None], np.zeros((2, 4))), r"stroke: got shape \[2, 4\]; give \[1, 4\]"),
     "unstable push": (lambda: js.step(SAND, LEVEL, STROKE, push=js.SteppedPush(rate=0.3)), r"push\.rate: got 0.3, unstable"),
     "tolerance without end": (lambda: js.settle(SAND, LEVEL, stop=js.UntilStill(np.inf)), r"stop\.tolerance: got inf"),
