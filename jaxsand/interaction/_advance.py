@@ -201,9 +201,10 @@ class Advance(Step):
     ) -> tuple[jax.Array, jax.Array]:
         """What a blade whose bottom rises or sinks takes up, and its bottom over each cell afterwards (quanta)."""
         assert way.rise is not None
-        old, new = (self.floor(way, reach, by) for by in (begin, begin + ahead))
+        new = self.floor(way, reach, begin + ahead)
         if way.room is not None:
             return blade.cleared(reach, near, new), new
+        old = self.floor(way, reach, begin)
         return blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near)), new
 
     def displaced(

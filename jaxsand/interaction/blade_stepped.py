@@ -31,7 +31,7 @@ from jaxsand.interaction._block import SPARE, Block, Way
 from jaxsand.interaction._displacement import Job
 from jaxsand.interaction._leg import Steps, chunk, moved, way_of
 from jaxsand.interaction._lowering import Lower
-from jaxsand.interaction._path import Pushed, Record, State, along_legs, travelled, upright
+from jaxsand.interaction._path import Pushed, Record, State, along_legs, heading, travelled, upright
 from jaxsand.interaction._turning import Turn
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.scene.scene import Scene
@@ -74,7 +74,7 @@ def scoop_along(
     Returns the map, and the account (low, high) of the sum of heights (m) in the bucket.
     """
     runs = path[1:] - path[:-1]
-    lengths = jax.vmap(_length)(runs[:, :2])
+    lengths = jax.vmap(lambda start, stop: heading(start, stop, None)[1])(path[:-1, :2], path[1:, :2])
     dx = scene.grid.spacing
     thick = jnp.clip(_KEEPS * jnp.sum(lengths), 1e-6 * dx, dx)
     ends = lengths[jnp.array([0, -1])]
@@ -87,12 +87,6 @@ def scoop_along(
     pushed, _, scooped = travelled(scene, height, path, push.rate, leg, rises=True, room=room)
     assert scooped is not None
     return pushed, scooped
-
-
-def _length(run: jax.Array) -> jax.Array:
-    """The length of a vector, with a derivative at 0."""
-    square = jnp.sum(run**2)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def _leg(

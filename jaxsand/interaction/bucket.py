@@ -18,12 +18,11 @@ from jaxtyping import Array, Float
 from jaxsand.interaction._path import farthest, heading
 from jaxsand.interaction.blade_stepped import scoop_along
 from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured
-from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, lifted, ready
+from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, as_path, lifted, ready
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
-from jaxsand.scene.masked import POINTS
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import Blade, Bucket, Pose
 from jaxsand.scene.validation import concrete
@@ -127,7 +126,7 @@ def scoop(
         raise ValueError(f"push: got {push!r}; a bucket scoops by SteppedPush(substep, sweeps)")
     edge = replace(scene, tool=Blade(bucket.width, scene.grid.spacing, bucket.depth))
     edge, height, rules = ready(edge, height, push, scheme, stop)
-    path = _path(path, height.dtype, 2)
+    path = as_path(path, height.dtype)
     if path.shape[1] == 2:
         path = jnp.concatenate([path, jnp.full_like(path[:, :1], -jnp.asarray(bucket.depth, path.dtype))], 1)
     held = _one_load(load, height.dtype)
@@ -182,7 +181,7 @@ def dump(
         check_amount("amount", amount, "give what to pour, or None for all of it")
     scheme, stop = check_rule(scene, scheme, stop)
     scene, height = fit(scene, height)
-    path = _path(path, height.dtype, 1)[:, :2]
+    path = as_path(path, height.dtype, 1)[:, :2]
     held = _one_load(load, height.dtype)
     pour = None if amount is None else as_array("amount", amount, height.dtype)
     return _dumped(scene, height, path, held, pour, cast((scheme, stop), height.dtype))
@@ -210,15 +209,6 @@ def _bucket(scene: Scene) -> Bucket:
             f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Bucket(width, length, capacity))"
         )
     return scene.tool
-
-
-def _path(path: ArrayLike, dtype: jax.typing.DTypeLike, least: int) -> jax.Array:
-    path = as_array("path", path, dtype, POINTS)
-    if path.ndim != 2 or path.shape[0] < least or path.shape[1] not in (2, 3):
-        points = "two points" if least > 1 else "one point"
-        remedy = "use jax.vmap" if path.ndim > 2 else f"give at least {points} x, y [n, 2] or x, y, z [n, 3] in metres"
-        raise ValueError(f"path: got shape {list(path.shape)}; {remedy}")
-    return path
 
 
 def _load(load: Load | None, dtype: jax.typing.DTypeLike | None) -> Load:

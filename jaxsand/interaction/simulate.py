@@ -189,7 +189,7 @@ def follow(
         0.06 0.06 1.00
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
-    path = _path(path, height.dtype)
+    path = as_path(path, height.dtype)
     return as_needed(partial(_followed, height, path, rules), scene, rules, (height, path))
 
 
@@ -229,7 +229,7 @@ def follow_frames(
         (1, 8, 8)
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
-    path = _path(path, height.dtype)
+    path = as_path(path, height.dtype)
     return as_needed(lambda scene, _: _follow(scene, height, path, rules, record=_itself), scene, rules, (height, path))
 
 
@@ -351,10 +351,12 @@ def _stroke(stroke: ArrayLike, dtype: DTypeLike) -> Float[Array, "2 _"]:
     return stroke.reshape(2, -1)
 
 
-def _path(path: ArrayLike, dtype: DTypeLike) -> Float[Array, "n _"]:
+def as_path(path: ArrayLike, dtype: DTypeLike, least: int = 2) -> Float[Array, "n _"]:
+    """The path of `least` points or more, one or two; ValueError if it has the wrong shape."""
     path = as_array("path", path, dtype, POINTS)
-    if path.ndim != 2 or path.shape[0] < 2 or 2 * path.shape[1] not in STROKES:
-        remedy = "use jax.vmap" if path.ndim > 2 else "give at least two points x, y [n, 2] or x, y, z [n, 3] in metres"
+    if path.ndim != 2 or path.shape[0] < least or 2 * path.shape[1] not in STROKES:
+        points = "two points" if least > 1 else "one point"
+        remedy = "use jax.vmap" if path.ndim > 2 else f"give at least {points} x, y [n, 2] or x, y, z [n, 3] in metres"
         raise ValueError(f"path: got shape {list(path.shape)}; {remedy}")
     return path
 

@@ -54,8 +54,8 @@ class Acts:
         Raises:
           ValueError: for a scene of another size than the training's, or without a blade.
         """
-        if scene.grid.shape != (SHAPE[0], SHAPE[0]):
-            raise ValueError(f"scene.grid.shape: got {scene.grid.shape}; this policy only knows ({SHAPE[0]}, {SHAPE[0]})")
+        if scene.grid.shape != SHAPE:
+            raise ValueError(f"scene.grid.shape: got {scene.grid.shape}; this policy only knows {SHAPE}")
         depth = float(blade_of(scene).depth)
         maps = {name: jnp.asarray(x, jnp.float32) / depth for name, x in (("goal", goal), ("current", current))}
         tried = 1 if count == 1 else _TRIED * count
