@@ -55,7 +55,9 @@ if TYPE_CHECKING:
     from jaxsand.relaxation.stopping import Outcome as Outcome
     from jaxsand.relaxation.stopping import Sweeps as Sweeps
     from jaxsand.relaxation.stopping import UntilStill as UntilStill
+    from jaxsand.scene.boundaries import Base as Base
     from jaxsand.scene.boundaries import Closed as Closed
+    from jaxsand.scene.boundaries import Deep as Deep
     from jaxsand.scene.boundaries import Draining as Draining
     from jaxsand.scene.boundaries import Open as Open
     from jaxsand.scene.boundaries import Walls as Walls
@@ -89,12 +91,14 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "AsNeeded": "scene.window",
+    "Base": "scene.boundaries",
     "Blade": "scene.tools",
     "Blurred": "planning.gradient",
     "Bucket": "scene.tools",
     "Calibration": "terramechanics._least_squares",
     "Closed": "scene.boundaries",
     "DRY_SAND": "scene.material",
+    "Deep": "scene.boundaries",
     "Draining": "scene.boundaries",
     "Grid": "scene.grid",
     "Grousers": "scene.tools",

@@ -125,7 +125,7 @@ class Advance(Step):
 
         def substep(i: jax.Array, carry: tuple[State, jax.Array | None, Lost]) -> tuple[State, jax.Array | None, Lost]:
             (h, flux, stand), gone, scooped = carry
-            cut = self.cut(way, k, first, i, self.block.part(h))
+            cut = self.cut(way, k, first, view, i, self.block.part(h))
             taken = cut.taken
             if way.room is not None:
                 into, scooped = blade.scooped(way.room, scooped, taken * at(self.block.part(view.holds)))
@@ -141,7 +141,8 @@ class Advance(Step):
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
         lost = self.block.lose(way, view, sand.lost, gone)
         out = Moving(self.block.back(way, view, sand.height, new), lost, after, edge, scooped)
-        if self.block.drains or way.drop.ndim == sand.height.ndim or way.room is not None:
+        others = (way.room, way.base)
+        if self.block.drains or way.drop.ndim == sand.height.ndim or any(other is not None for other in others):
             return out, sand
         return out, (jnp.where(at(view.holds) > 0, old, jnp.nan), flux)
 
@@ -162,21 +163,21 @@ class Advance(Step):
         self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: State
     ) -> tuple[Ready, jax.Array | None]:
         """Sub-step i of step k up to when the sand comes to rest, and what was lost."""
-        cut = self.cut(way, k, first, i, self.block.part(state[0]))
+        cut = self.cut(way, k, first, view, i, self.block.part(state[0]))
         return self.displaced(cut, rate, view, state, cut.taken)
 
-    def cut(self, way: Way, k: jax.Array, first: First, i: jax.Array, near: jax.Array) -> Cut:
+    def cut(self, way: Way, k: jax.Array, first: First, view: View, i: jax.Array, near: jax.Array) -> Cut:
         """What the blade cuts in sub-step i of step k from the heights `near` it."""
         moving = k >= int(self.lowered)
         begin = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(way.length.dtype) * self.substep
         begin = jnp.minimum(begin, way.length)
         ahead = jnp.where(moving, jnp.minimum(way.length - begin, self.substep), 0)
         reach = self.reach(way, first, begin, ahead)
-        if way.rise is None:
+        if way.rise is None and view.base is None:
             taken = blade.cleared(reach, near, spread(way.bottom / way.quantum, near))
         else:
-            taken, floor = self.beneath(way, reach, near, begin, ahead)
-            way = replace(way, bottom=floor * spread(way.quantum, near))
+            taken, bottom = self.beneath(way, reach, view, near, begin, ahead)
+            way = replace(way, bottom=bottom * spread(way.quantum, near))
         return Cut(way, reach, moving, jnp.where(moving, ahead / self.substep, 1), jnp.where(ahead > 0, taken, 0))
 
     def reach(self, way: Way, first: First, begin: jax.Array, ahead: jax.Array) -> blade.Reach:
@@ -197,14 +198,13 @@ class Advance(Step):
         return blade.slanted(old, new, half, side, further)
 
     def beneath(
-        self, way: Way, reach: blade.Reach, near: jax.Array, begin: jax.Array, ahead: jax.Array
+        self, way: Way, reach: blade.Reach, view: View, near: jax.Array, begin: jax.Array, ahead: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """What a blade whose bottom rises or sinks takes up, and its bottom over each cell afterwards (quanta)."""
-        assert way.rise is not None
-        new = self.floor(way, reach, begin + ahead)
-        if way.room is not None:
+        """What a blade with another bottom over each cell takes up, and that bottom afterwards (quanta)."""
+        new = self.block.above(view, self.bottom(way, reach, begin + ahead))
+        if way.rise is None or way.room is not None:
             return blade.cleared(reach, near, new), new
-        old = self.floor(way, reach, begin)
+        old = self.block.above(view, self.bottom(way, reach, begin))
         return blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near)), new
 
     def displaced(
@@ -227,13 +227,14 @@ class Advance(Step):
         guess = self.block.guess(around.gates, jnp.where(cut.moving, cut.part, 0), flux)
         return Ready(around, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
 
-    def floor(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
+    def bottom(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
         """The blade's bottom over each cell near it (quanta), when it has moved by a length (spacings).
 
-        Under a bottom that rises, each cell's floor is where the blade's front left it. A bucket's edge is thin: it leaves
-        each cell at the height of the path there.
+        A bottom that rises is in each cell where the blade's front left it. A bucket's edge is thin: it leaves each cell at
+        the height of the path there.
         """
-        assert way.rise is not None
+        if way.rise is None:
+            return spread(way.bottom / way.quantum, inner(reach.along))
         behind = blade.behind_the_front(reach, spread(way.half, inner(reach.along)))
         if way.yaw is not None:
             behind = behind / jnp.cos(way.yaw)

@@ -40,6 +40,7 @@ class Way:
         angle: angle by which the blade turns in place before the leg (rad).
         yaw: angle from the direction of travel to the blade's normal (rad), or None if it stands square to its way.
         room: sum of heights that the tool's bucket can take up from the path's start on (quanta), or None if it has none.
+        base: height of the floor under the sand, a flat map [cells] (m), or None if there is none.
     """
 
     start: Pose
@@ -56,6 +57,7 @@ class Way:
     rise: jax.Array | None
     room: jax.Array | None = None
     yaw: jax.Array | None = None
+    base: jax.Array | None = None
 
     def at(self, by: jax.Array) -> "Way":
         """The leg as it is when the blade has moved by a length (spacings): with its bottom at the height there."""
@@ -93,6 +95,7 @@ class View:
         drop: largest stable step (quanta).
         sides: number of sides over which each cell drains, or None where the edge is closed.
         beyond: 1 for cells beyond a rim, with ghost cells, or None where the edge is closed.
+        base: height of the floor under the sand (whole quanta, rounded up), or None if there is none.
     """
 
     where: Places
@@ -100,6 +103,7 @@ class View:
     drop: jax.Array
     sides: jax.Array | None
     beyond: jax.Array | None
+    base: jax.Array | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -197,12 +201,21 @@ class Block:
             edges = [where.row == 0, where.row == rows - 1, where.column == 0, where.column == columns - 1]
             sides = jnp.stack([jnp.where(e & where.inside, 1.0, 0.0) for e in edges]).sum(0).astype(h.dtype)
             beyond = halo(jnp.where(where.inside, 0.0, 1.0).astype(h.dtype), 1.0)
-        view = View(where, halo(jnp.where(solid, 0.0, 1.0).astype(h.dtype), 0.0), drop / way.quantum, sides, beyond)
+        base = None
+        if way.base is not None:
+            base = cut(where, way.base, 0.0) / way.quantum
+            base = base + lax.stop_gradient(jnp.ceil(base) + 1 - base)
+        holds = halo(jnp.where(solid, 0.0, 1.0).astype(h.dtype), 0.0)
+        view = View(where, holds, drop / way.quantum, sides, beyond, base)
         return view, jnp.where(solid, 0, h)
 
     def back(self, way: Way, view: View, flat: jax.Array, h: jax.Array) -> jax.Array:
         """The flat map (m) with the block's heights (quanta) written back."""
         return paste(view.where, flat, jnp.where(at(view.holds) > 0, h * way.quantum, jnp.nan))
+
+    def above(self, view: View, bottom: jax.Array) -> jax.Array:
+        """The bottom of a tool over each cell of the inner part (quanta), which cuts no floor: `bottom`, or the floor."""
+        return bottom if view.base is None else jnp.maximum(bottom, self.part(view.base))
 
     def lose(self, way: Way, view: View, lost: Lost, amount: jax.Array | None) -> Lost:
         """The account of losses after the block lost an amount (quanta)."""
@@ -245,7 +258,7 @@ class Block:
         bottom = way.bottom / way.quantum
         if bottom.ndim == near.open.ndim:
             bottom = self.put(jnp.zeros_like(stand.open), bottom)
-        return Sand(stand.gates, stand.open, stand.stretch, bottom, view.drop, view.sides, rim, self.neighbours)
+        return Sand(stand.gates, stand.open, stand.stretch, bottom, view.drop, view.sides, rim, self.neighbours, view.base)
 
     def guess(self, gates: Fluxes, part: jax.Array, flux: Fluxes) -> Fluxes:
         """The fluxes from which a sub-step starts: the share `part` of the last ones, less over links that are closing.

@@ -43,18 +43,13 @@ class Beside:
 
     def pull(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
         bed, flow, around = params
-        if not by_hand(bed) or not self.sweeps:
+        if not bed.by_links or not self.sweeps:
             return Plain(self).pull(params, k, record, cotangent)
         of = pull(bed, flow, around, surfaces(bed, flow, around, self.sweeps, record[0]), cotangent[0])
         dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
         daround = replace(daround, open=halo(of.open, 0.0), stretch=of.stretch, bottom=of.bottom)
         dparams = (replace(dbed, drop=of.drop), replace(dflow, rate=of.rate), daround)
         return split(dparams)[0], (of.height, None)
-
-
-def by_hand(bed: Bed) -> bool:
-    """Whether the derivatives written out here hold: with 4 or 8 neighbours and a closed edge."""
-    return bed.neighbours != "isotropic" and bed.rim is None
 
 
 @dataclass(frozen=True)

@@ -143,6 +143,7 @@ def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.
         None if job.rise is None else job.rise * dx,
         None if job.room is None else job.room / job.flow.quantum,
         None if yaw is None else jnp.asarray(yaw),
+        None if job.bed.base is None else job.bed.base.reshape(-1),
     )
 
 

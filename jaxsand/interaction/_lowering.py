@@ -33,7 +33,8 @@ class Lower(Step):
         beside = blade.share(across, -way.side, way.side)
         cover = inner(blade.straight(along, beside, way.half, jnp.zeros_like(way.length)).after)
         along, across = inner(along), inner(across)
-        taken = truncate(cover * jnp.maximum(old - way.bottom / way.quantum, 0)) * at(holds)
+        bottom = self.block.above(view, way.bottom / way.quantum)
+        taken = truncate(cover * jnp.maximum(old - bottom, 0)) * at(holds)
         s, n = along / (4 * way.half**2), across / (4 * way.side**2)
         p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
         size = jnp.maximum(jnp.abs(p), jnp.abs(q))

@@ -14,6 +14,7 @@ from jaxsand.interaction._displacement import Job
 from jaxsand.relaxation.flux import worst_excess
 from jaxsand.relaxation.ghost_cells import (
     Lost,
+    below_base,
     halo,
     largest,
     mark,
@@ -183,8 +184,9 @@ def travelled(
     drained = volume_lost(bed, lost)
     end = Pose(path[-1, 0], path[-1, 1], pose.cos, pose.sin)
     broken = broken | spoiled(intact, marked) | ~sound(bed) | ~usable
+    outcome = _outcome(edge, broken) | said(Outcome.BELOW_BASE, below_base(bed, intact))
     scooped = jax.tree.map(lambda count: count * flow.quantum, state.scooped)
-    return Pushed(unmark(marked, height), _outcome(edge, broken), drained, end), frames, scooped
+    return Pushed(unmark(marked, height), outcome, drained, end), frames, scooped
 
 
 def farthest(scene: Scene, dtype: DTypeLike) -> jax.Array:

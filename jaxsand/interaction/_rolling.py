@@ -41,7 +41,7 @@ class Touchdown(_OfWheel):
         way, frame = track.way, frame_of(self.block.shape, track.way.start)
         first = self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
-        here = wheel.stand(self.block, track, frame, first)
+        here = wheel.stand(self.block, track, frame, first, view)
         taken = truncate(here.cover * jnp.maximum(old - here.rim, 0)) * at(view.holds)
         gone = None if view.beyond is None else jnp.zeros_like(old)
         onward = Plain(_Onward(self.block), 16)
@@ -118,7 +118,7 @@ class Turn(_Moved):
         after = replace(frame, pose=rotated(way.start, sign * (begin + ahead)))
         first = self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
-        before, now = (wheel.stand(self.block, track, f, first) for f in (frame, after))
+        before, now = (wheel.stand(self.block, track, f, first, view) for f in (frame, after))
         taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, old), 0) * at(view.holds)
         shares = wheel.turning(track, frame, before, sign)
         new, flux, gone = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
@@ -153,7 +153,7 @@ class Roll(_Moved):
         def substep(i: jax.Array, state: Sanded) -> Sanded:
             h, flux, gone = state
             (begin, end), ahead = self._ends(track, k, i)
-            before, now = (wheel.stand(block, track.at(by), _at(frame, by), first) for by in (begin, end))
+            before, now = (wheel.stand(block, track.at(by), _at(frame, by), first, view) for by in (begin, end))
             taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, h), 0) * at(view.holds)
             h, left = wheel.carried_back(block, track, _at(frame, end), first, view, ahead, h, taken)
             h = h - taken + left
@@ -166,7 +166,7 @@ class Roll(_Moved):
 
         new, flux, gone = lax.fori_loop(0, self.chunk, substep, (old, flux, gone))
         ends = self._ends(track, k, jnp.int32(0))[0][0], self._ends(track, k, jnp.int32(self.chunk - 1))[0][1]
-        cover = jnp.maximum(*(wheel.stand(block, track, _at(frame, by), first).cover for by in ends))
+        cover = jnp.maximum(*(wheel.stand(block, track, _at(frame, by), first, view).cover for by in ends))
         edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, new, cover))
         return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
 

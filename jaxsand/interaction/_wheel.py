@@ -84,8 +84,8 @@ class Stand:
         return self.lengthwise * self.crosswise
 
 
-def stand(block: Block, track: Track, frame: Frame, first: First) -> Stand:
-    """The wheel at the frame's pose.
+def stand(block: Block, track: Track, frame: Frame, first: First, view: View) -> Stand:
+    """The wheel at the frame's pose, with its rim no lower than the floor under the sand.
 
     At the distance a from the axle its rim stands r - sqrt(r^2 - a^2) above its lowest point. The footprint is smoothed like
     a blade's.
@@ -97,6 +97,7 @@ def stand(block: Block, track: Track, frame: Frame, first: First) -> Stand:
     r, side = spread(track.radius, s), spread(way.side, s)
     square = jnp.where(jnp.abs(a) < 0.999 * r, r * r - a * a, 0.002 * r * r)
     rim = (r - jnp.sqrt(square)) * spread(way.spacing / way.quantum, s) + spread(way.bottom / way.quantum, s)
+    rim = block.above(view, rim)
     return lax.optimization_barrier(Stand(a, c, blade.share(a, -r, r), blade.share(c, -side, side), rim))
 
 
@@ -230,7 +231,7 @@ def around(block: Block, track: Track, view: View, wheel: Stand, h: jax.Array) -
     free, gates = _gates(block.neighbours, wheel, touch, view.holds)
     stretch = lax.optimization_barrier((1 - free) / jnp.maximum(free, _SLIVER))
     level = None if way.level is None else way.level / way.quantum
-    sand = Sand(gates, free, stretch, wheel.rim, view.drop, view.sides, level, block.neighbours)
+    sand = Sand(gates, free, stretch, wheel.rim, view.drop, view.sides, level, block.neighbours, view.base)
     return sand, block.contact(_under(way, wheel), view, wheel.cover, h)
 
 

@@ -37,7 +37,7 @@ from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slic
 from jaxsand.relaxation.ghost_cells import Lost, lose
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
-from jaxsand.scene.scene import Scene
+from jaxsand.scene.scene import Scene, deep
 from jaxsand.scene.tools import Blade, NoTool, Pose, coverage, local, square
 from jaxsand.scene.window import Whole
 
@@ -102,6 +102,7 @@ class SwathPush:
             )
         if isinstance(scene.tool, Blade):
             square(scene.tool)
+        deep(scene, "SwathPush")
         check_whole("push.sweeps", self.sweeps, 0)
         check_rate(scene, "push.rate", self.rate)
 

@@ -32,7 +32,11 @@ _ADVICE = {
         "down: look with numpy.isfinite, and give every leg with heights a length"
     ),
     Outcome.NOT_POURED: (
-        "less sand was poured than asked for: ask for at most load_volume(scene, load), and pour onto cells with sand"
+        "less sand was poured or removed than asked for: ask for at most load_volume(scene, load), or what lies on the "
+        "base, and pour onto cells with sand"
+    ),
+    Outcome.BELOW_BASE: (
+        "the map lies below the scene's base somewhere, where no sand can be: start from jnp.maximum(height, base)"
     ),
 }
 

@@ -1,6 +1,7 @@
 """Sand that is put down or taken away: from a bucket, at a point, or over a footprint."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import heading
-from jaxsand.relaxation.ghost_cells import counted, largest, mark, prepare, quantum, truncate, unmark
+from jaxsand.relaxation.ghost_cells import Bed, counted, largest, mark, prepare, quantum, truncate, unmark
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
@@ -21,6 +22,7 @@ from jaxsand.scene.tools import interval, local
 from jaxsand.scene.validation import concrete, short
 
 Account = tuple[jax.Array, jax.Array]
+_ROUNDS = 32  # in each of which the cells that are emptied are found; on the usual footprints two or three suffice
 
 
 def deposit(
@@ -77,7 +79,8 @@ def remove(
 ) -> Settled:
     """Takes sand away and lets the rest settle: the opposite of `deposit`, with the same arguments.
 
-    A volume V lowers cell [i, j] by V w[i, j] / (dx^2 sum w).
+    A volume V lowers cell [i, j] by V w[i, j] / (dx^2 sum w). On a floor (`Base`) a cell gives no more than lies on it, and
+    the others give the rest in the same proportions; where that is not enough, the outcome says NOT_POURED.
 
     Example:
         >>> import jax.numpy as jnp
@@ -115,7 +118,7 @@ def _changed(
         )
     check_amount("volume", volume, f"give what to {name}, 0 or more")
     volume = as_array("volume", volume, height.dtype)
-    return _settled(scene, height, where, volume, cast((scheme, stop), height.dtype), sign)
+    return _settled(scene, height, where, volume, cast((scheme, stop), height.dtype), sign=sign)
 
 
 def check_amount(name: str, value: object, remedy: str) -> None:
@@ -125,16 +128,43 @@ def check_amount(name: str, value: object, remedy: str) -> None:
         raise ValueError(f"{name}: got {short(value)}; it must be one finite number of m^3: {remedy}")
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="sign")
 def _settled(
-    scene: Scene, height: jax.Array, where: jax.Array, volume: jax.Array, rules: tuple[Scheme, Stop], sign: jax.Array
+    scene: Scene, height: jax.Array, where: jax.Array, volume: jax.Array, rules: tuple[Scheme, Stop], *, sign: float
 ) -> Settled:
     if where.ndim == 1:
         where = point_weights(scene, where)
     amount = volume / scene.grid.spacing**2
-    changed, _, missed = poured(scene, height, where, amount, (jnp.zeros_like(amount), amount), sign)
+    bed, there = prepare(scene), amount
+    if bed.base is not None and sign < 0:
+        where, there = _on_floor(bed, mark(scene, height)[0] - bed.base, where, amount)
+    changed, _, missed = poured(scene, height, where, amount, (jnp.zeros_like(amount), there), sign)
     settled = relax(scene, changed, *rules)
     return replace(settled, outcome=settled.outcome | missed)
+
+
+def _on_floor(bed: Bed, thick: jax.Array, weights: jax.Array, amount: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What each cell gives of a sum of heights `amount` (m) taken from sand of some thickness, and the most there is.
+
+    Cell k gives min(s w_k, t_k), of weight w_k and thickness t_k, with s such that the sum is the amount.
+    """
+    assert bed.base is not None
+    spare = 4 * quantum(2 * (largest(bed.base) + largest(thick)))  # so that rounding takes no cell below its floor
+    weights = jnp.where(weights > 0, weights, 0)
+    thick = jnp.where((thick > spare) & (weights > 0), thick - spare, 0)
+    weights = weights / jnp.where(jnp.max(weights) > 0, jnp.max(weights), 1)
+    most = jnp.sum(jnp.sum(thick, axis=0))
+
+    def scale(empty: jax.Array) -> jax.Array:
+        left = amount - jnp.sum(jnp.sum(jnp.where(empty, thick, 0), axis=0))
+        share = jnp.sum(jnp.sum(jnp.where(empty, 0, weights), axis=0))
+        return jnp.where(share > 0, jnp.maximum(left, 0) / jnp.where(share > 0, share, 1), jnp.inf)
+
+    def once(_: jax.Array, empty: jax.Array) -> jax.Array:
+        return empty | (lax.stop_gradient(scale(empty)) * weights >= thick)
+
+    empty = lax.fori_loop(0, _ROUNDS, once, weights <= 0)
+    return jnp.where(empty, thick, jnp.minimum(jnp.where(empty, 0, weights) * scale(empty), thick)), most
 
 
 def poured(

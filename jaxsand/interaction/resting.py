@@ -21,6 +21,8 @@ cell this is r n <= 1. Else it holds if 2 / w >= 1 / o + 1 / o' for the two ends
 mean. Isotropic sand couples two links in a gradient, which need one common weight: both the step and the flux of a link are
 multiplied by a factor a, below 1 only where the link is nearly closed, and the weight is the lesser of the two links' w /
 a^2. Fluxes are whole quanta (ghost_cells.py).
+
+On a floor no cell gives more than it held before the steps (floor.py).
 """
 
 from dataclasses import dataclass, field
@@ -31,7 +33,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.interaction.stencil import both_ends, inner, net, outer, rises
-from jaxsand.relaxation.flux import Fluxes, ends, share_beyond
+from jaxsand.relaxation.floor import held, no_more_than
+from jaxsand.relaxation.flux import THIN, Fluxes, ends, share_beyond
 from jaxsand.relaxation.ghost_cells import nearest, truncate
 from jaxsand.scene.grid import Neighbours, links
 
@@ -56,6 +59,7 @@ class Sand:
         sides: number of sides over which each cell drains [m, m], or None where the edge is closed.
         rim: height of the draining rim, or None.
         neighbours: 4, 8 or "isotropic".
+        base: height of the floor [m, m] (whole quanta), or None without one.
     """
 
     gates: Fluxes
@@ -66,6 +70,7 @@ class Sand:
     sides: Map | None
     rim: Float[Array, "..."] | None
     neighbours: Neighbours = field(metadata={"static": True})
+    base: Map | None = None
 
     def surface(self, h: Map) -> Map:
         """The height at which the sand of each cell stands in its open share."""
@@ -84,9 +89,10 @@ def no_flux(neighbours: Neighbours, drains: bool, h: Map) -> Fluxes:
 
 def bring_to_rest(sand: Sand, rate: Float[Array, "..."], sweeps: int, h: Map, guess: Fluxes) -> tuple[Map, Fluxes]:
     """The heights after a number of proximal steps that start from a guess of the fluxes, and the fluxes."""
-    model: Links | _Gradients = Links(sand, rate)
+    there = None if sand.base is None else held(h, sand.base, jnp.ones((), h.dtype))
+    model: Links | _Gradients = Links(sand, rate, there)
     if sand.neighbours == "isotropic":
-        model = _Gradients(sand, _CALM * rate)
+        model = _Gradients(sand, _CALM * rate, there)
 
     def stage(_: jax.Array, flux: Fluxes) -> Fluxes:
         # The model passes the barrier too: XLA would else compute parts of the step beforehand and store them.
@@ -100,10 +106,14 @@ def bring_to_rest(sand: Sand, rate: Float[Array, "..."], sweeps: int, h: Map, gu
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Links:
-    """The proximal steps with 4 or 8 neighbours: one flux for each link, in whole quanta."""
+    """The proximal steps with 4 or 8 neighbours: one flux for each link, in whole quanta.
+
+    `there` is what each cell holds on a floor (quanta), or None without one.
+    """
 
     sand: Sand
     rate: jax.Array
+    there: Map | None = None
 
     @property
     def factors(self) -> list[jax.Array]:
@@ -128,7 +138,7 @@ class Links:
             out.append(nearest(z - jnp.where(z > most, most, jnp.where(z < -most, -most, z))))
         if self.sand.sides is not None:
             out.append(_over(self.sand, self.rate, flux[-1], inner(around)))
-        return tuple(out)
+        return tuple(out) if self.there is None else no_more_than(neighbours, self.there, out)
 
     def gained(self, flux: Fluxes) -> jax.Array:
         return _gained(self.sand, flux)
@@ -137,14 +147,22 @@ class Links:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class _Gradients:
-    """The proximal steps of isotropic sand: fluxes along x and y for each of a cell's four one-sided gradients, in turn."""
+    """The proximal steps of isotropic sand: fluxes along x and y for each of a cell's four one-sided gradients, in turn.
+
+    `there` is as of `Links`. A link whose upper end is bare floor has no step, as if a wall stood there.
+    """
 
     sand: Sand
     rate: jax.Array
+    there: Map | None = None
 
     def shrink(self, y: Fluxes, around: jax.Array) -> Fluxes:
         """The fluxes after one proximal step; `around` is the surface with ghost cells."""
         arms = [d * _felt(gate) for d, gate in zip(rises("isotropic", around), self.sand.gates, strict=True)]
+        if self.there is not None:
+            wet = outer(jnp.where(self.there > jnp.maximum(THIN * self.sand.drop, 8), 1.0, 0.0).astype(around.dtype))
+            both = both_ends("isotropic", wet)
+            arms = [d * jnp.where(d > 0, there, here) for d, (here, there) in zip(arms, both, strict=True)]
         across, up = _both_ends(arms)
         of_x, of_y = _both_ends([_weight(gate) for gate in self.sand.gates])
         out = []
@@ -165,8 +183,8 @@ class _Gradients:
         over_x = (jnp.concatenate([column, east], 1) + jnp.concatenate([west, column], 1)) / 4
         over_y = (jnp.concatenate([row, north], 0) + jnp.concatenate([south, row], 0)) / 4
         moved = tuple(truncate(f * _felt(g)) for f, g in zip((over_x, over_y), self.sand.gates, strict=True))
-        moved = lax.optimization_barrier(moved)
-        return _gained(self.sand, (*moved, *((flux[-1],) if self.sand.sides is not None else ())))
+        moved = (*lax.optimization_barrier(moved), *((flux[-1],) if self.sand.sides is not None else ()))
+        return _gained(self.sand, moved if self.there is None else no_more_than("isotropic", self.there, moved))
 
 
 def _both_ends(arms: list[jax.Array]) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:

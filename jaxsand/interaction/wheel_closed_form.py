@@ -23,7 +23,7 @@ from jaxsand.interaction._displacement import Job, whole
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._slices import hat, wedge
 from jaxsand.interaction.blade_closed_form import ROOM, complete, typical_drop
-from jaxsand.scene.scene import Scene
+from jaxsand.scene.scene import Scene, deep
 from jaxsand.scene.tools import Grousers, NoTool, Pose, Wheel, carried_area, half_chord, local, reach
 from jaxsand.scene.window import Whole
 
@@ -62,6 +62,7 @@ class SplitPush:
             raise ValueError(
                 f"push: got SplitPush for a {type(scene.tool).__name__}; SplitPush() is for a Wheel, SteppedPush() for both"
             )
+        deep(scene, "SplitPush")
 
     def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Tree]:
         """Moves the scene's wheel along the path; see `PushRule`."""

@@ -13,9 +13,9 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
 from jaxsand.relaxation._rkl import Surges
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
-from jaxsand.relaxation.ghost_cells import Bed, Lost, grain, truncate
+from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, truncate
 from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
-from jaxsand.relaxation.sweep import Flow, Sweep, apply
+from jaxsand.relaxation.sweep import Flow, Sweep, apply, within
 from jaxsand.scene.grid import links
 
 Sand: TypeAlias = tuple[jax.Array, Lost]  # a map with ghost cells, and what it lost over the rim
@@ -154,11 +154,11 @@ def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
             turn = (np.arange(rows)[:, None] if link[0] else np.arange(columns)[None, :]) % 2 == colour
             moved = list(fluxes_zero(bed, u))
             moved[chosen] = lax.optimization_barrier(jnp.where(turn, truncate(excess * scale), 0))
-            u, lost = apply(bed, flow, tuple(moved), u, lost)
+            u, lost = apply(bed, flow, within(bed, flow, tuple(moved), at(u)), u, lost)
     if bed.rim is None:
         return u, lost
     drain = truncate(fluxes(bed, Nothing(), u)[-1] * (scale / 2))  # a cell has up to four sides
-    return apply(bed, flow, (*fluxes_zero(bed, u)[:-1], drain), u, lost)
+    return apply(bed, flow, within(bed, flow, (*fluxes_zero(bed, u)[:-1], drain), at(u)), u, lost)
 
 
 _EACH_PAIR = Plain(lambda params, _, state: _each_pair(*params, *state))

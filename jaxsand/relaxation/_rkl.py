@@ -24,8 +24,8 @@ State: TypeAlias = tuple[jax.Array, Lost, Fluxes]  # a map with ghost cells, its
 class Surges:
     """A group of `interval` RKL stages of a schedule. `params` are the bed, the cells, and limits that it does not use.
 
-    With 4 or 8 neighbours and a closed edge it records two bits for each link and stage, from which flux_adjoint.py computes
-    the derivative. Else it records the state before the group, and JAX differentiates it.
+    With 4 or 8 neighbours, a closed edge and no floor it records two bits for each link and stage, from which
+    flux_adjoint.py computes the derivative. Else it records the state before the group, and JAX differentiates it.
     """
 
     plan: Schedule
@@ -43,7 +43,7 @@ class Surges:
 
     def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, Tree]:
         bed, around, _ = params
-        if not _by_links(bed):
+        if not bed.by_links:
             return Plain(self).recorded(params, k, state)
         rates, momenta = self._stages(k, state[0].dtype)
         cut = grain(bed, state[0])
@@ -63,7 +63,7 @@ class Surges:
 
     def push(self, params: Params, k: jax.Array, record: Tree, dparams: Tree, dstate: State) -> State:
         bed, around, _ = params
-        if not _by_links(bed):
+        if not bed.by_links:
             return Plain(self).push(params, k, record, dparams, dstate)
         rates, momenta = self._stages(k, dstate[0].dtype)
         dbed = split(params)[1](dparams)[0]
@@ -89,7 +89,7 @@ class Surges:
 
     def pull(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
         bed, around, _ = params
-        if not _by_links(bed):
+        if not bed.by_links:
             return Plain(self).pull(params, k, record, cotangent)
         rates, momenta = self._stages(k, cotangent[0].dtype)
         weights = flux_adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
@@ -142,11 +142,6 @@ def _code(codes: jax.Array, i: jax.Array) -> jax.Array:
     """The record of stage i in its low byte; a word of 32 bits holds the records of four stages."""
     word, shift = lax.optimization_barrier((lax.dynamic_index_in_dim(codes, i // 4, keepdims=False), 8 * (i % 4)))
     return lax.shift_right_logical(word, jnp.full(word.shape, shift, word.dtype))
-
-
-def _by_links(bed: Bed) -> bool:
-    """Whether the derivative follows from which links are active: with 4 or 8 neighbours and a closed edge."""
-    return bed.neighbours != "isotropic" and bed.rim is None
 
 
 def _surface(around: Nothing | Partial, u: jax.Array) -> jax.Array:

@@ -30,10 +30,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsand.relaxation.ghost_cells import Bed, Rim, at, halo
+from jaxsand.relaxation.ghost_cells import Bed, Rim, at, grain, halo
 from jaxsand.scene.grid import Link, Neighbours, links
 
 Fluxes = tuple[jax.Array, ...]
+THIN = 1e-4  # spacings: sand on a floor that is thinner counts as none
 NARROW = 0.05  # the smallest open share that is divided by: a cell still less open counts as if it were as open as this
 
 
@@ -137,7 +138,10 @@ def worst_excess(bed: Bed, u: Float[Array, "H+2 W+2"], around: Nothing | Partial
         u, gate = halo(around.surface(at(u))), around.open
     worst = _highest(_excesses(bed, gate, u))
     if bed.rim is not None:
-        worst = jnp.maximum(worst, jnp.max(jnp.where(_draining_sides(bed.rim) > 0, 2 * _over(bed, bed.rim, at(u)), 0)))
+        drains = _draining_sides(bed.rim) > 0
+        if bed.base is not None:
+            drains = drains & (at(_wet(bed, u)) > 0)
+        worst = jnp.maximum(worst, jnp.max(jnp.where(drains, 2 * _over(bed, bed.rim, at(u)), 0)))
     return worst / bed.spacing
 
 
@@ -159,7 +163,7 @@ def middle(bed: Bed, u: Float[Array, "H+2 W+2"], tolerance: Float[Array, ""]) ->
 
 
 def steepest(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Float[Array, ""]:
-    """The steepest slope (a tangent) of a map with ghost cells, as the bed's neighbourhood measures slopes."""
+    """The steepest slope (a tangent) of a map's sand, as the bed's neighbourhood measures slopes; not of bare floor."""
     return _highest(slope for slope, _ in _slopes(bed, u)) / bed.spacing
 
 
@@ -201,14 +205,18 @@ def link_flux(bed: Bed, gate: jax.Array | None, s: jax.Array, link: Link) -> jax
 def _slopes(bed: Bed, u: jax.Array) -> Iterator[tuple[jax.Array, jax.Array]]:
     """Slopes [H, W] and the largest stable ones, both times the spacing (m); for each direction of links, or gradient."""
     if bed.neighbours != "isotropic":
+        wet = None if bed.base is None else _wet(bed, u)
         for link in links(bed.neighbours):
             di, dj, length = link
             level = bed.drop
             if level.ndim:
                 level = (level + at(halo(level, 0.0), di, dj)) / 2
-            yield jnp.abs(at(u, di, dj) - at(u)) * (1 / length), level
+            d = at(u, di, dj) - at(u)
+            if wet is not None:
+                d = jnp.where(d > 0, at(wet, di, dj), at(wet)) * d
+            yield jnp.abs(d) * (1 / length), level
         return
-    x, y = _steps(u)
+    x, y = _steps(bed, u)
     for gx, gy, m in _gradients(bed, x / bed.spacing, y / bed.spacing):
         yield jnp.sqrt(gx * gx + gy * gy) * bed.spacing, m * bed.spacing
 
@@ -221,7 +229,7 @@ def _excesses(bed: Bed, gate: jax.Array | None, u: jax.Array) -> Iterator[jax.Ar
         for (slope, level), (di, dj, _) in zip(_slopes(bed, u), links(bed.neighbours), strict=True):
             yield (slope - level) * jnp.minimum(at(gate), at(gate, di, dj))
     else:
-        x, y = _steps(u)
+        x, y = _steps(bed, u)
         for (gx, gy, m), (ox, oy) in zip(_gradients(bed, x / bed.spacing, y / bed.spacing), _arms(gate), strict=True):
             along_x = jnp.abs(gx) * ox * share_beyond(gx * gx + oy * gy * gy, m)
             along_y = jnp.abs(gy) * oy * share_beyond(ox * gx * gx + gy * gy, m)
@@ -237,7 +245,7 @@ def _arms(gate: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
 
 def _isotropic(bed: Bed, gate: jax.Array | None, s: jax.Array) -> Fluxes:
     """The fluxes of isotropic sand over the straight links."""
-    x, y = _steps(s)
+    x, y = _steps(bed, s)
     weights = []
     if gate is None:
         for gx, gy, m in _gradients(bed, x / bed.spacing, y / bed.spacing):
@@ -268,12 +276,28 @@ def share_beyond(square: jax.Array, m: jax.Array) -> jax.Array:
     return jnp.where(square > least, 1 - m / size, 0)
 
 
-def _steps(u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The steps over the links along x [H, W + 1] and y [H + 1, W] (m); 0 where one end holds no sand."""
-    steps = []
+def _wet(bed: Bed, u: jax.Array) -> jax.Array:
+    """1 in the cells of a map with ghost cells that hold sand on the floor, else 0; it is not called without one.
+
+    Slopes count only where their upper end holds sand.
+    """
+    assert bed.base is not None
+    thin = jnp.maximum(THIN * bed.spacing, 8 * grain(bed, u))
+    return halo(jnp.where(at(u) - bed.base > thin, 1.0, 0.0).astype(u.dtype), 0.0)
+
+
+def _steps(bed: Bed, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The steps over the links along x [H, W + 1] and y [H + 1, W] (m); 0 where one end holds no sand.
+
+    A link whose upper end is bare floor carries none, as if a wall stood there.
+    """
+    steps, wet = [], None if bed.base is None else _wet(bed, u)
     for di, dj, _ in links(4):
         here, there = ends(u, di, dj)
         d = there - here
+        if wet is not None:
+            low, high = ends(wet, di, dj)
+            d = jnp.where(d > 0, high, low) * d
         steps.append(jnp.where(jnp.isnan(d), 0, d))
     return steps[0], steps[1]
 

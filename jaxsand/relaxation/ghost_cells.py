@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsand.scene.boundaries import Draining, Walls
+from jaxsand.scene.boundaries import Base, Draining, Walls
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import Scene
 
@@ -30,15 +30,22 @@ class Bed:
         spacing: distance of neighbouring cell centres dx (m).
         drop: largest stable step between straight neighbours, tan(angle of repose) dx (m).
         rim: the draining edge, or None where the edge is closed.
-        elsewhere: largest |height| outside the block of the map that is swept, or the depth of the rim below 0 (m).
+        base: height of the floor under the sand (m), or None for a bed without one.
+        elsewhere: largest |height| outside the block of the map that is swept, of the floor, or of a rim below 0 (m).
         neighbours: 4, 8 or "isotropic".
     """
 
     spacing: Float[Array, ""]
     drop: Float[Array, ""] | Float[Array, "H W"]
     rim: "Rim | None"
+    base: Float[Array, "H W"] | None
     elsewhere: Float[Array, ""]
     neighbours: Neighbours = field(metadata={"static": True})
+
+    @property
+    def by_links(self) -> bool:
+        """Whether the derivative of a sweep follows from which links are active: sand flows in pairs, and nothing else."""
+        return self.neighbours != "isotropic" and self.rim is None and self.base is None
 
 
 @jax.tree_util.register_dataclass
@@ -59,7 +66,11 @@ def prepare(scene: Scene) -> Bed:
     if rim is not None:  # sand comes to lie as deep as the rim
         level = lax.stop_gradient(rim.level)
         deep = jnp.where((level < 0) & jnp.isfinite(level), -level, 0).astype(dx.dtype)
-    return Bed(dx, drop, rim, deep, scene.grid.neighbours)
+    base = None
+    if isinstance(scene.base, Base):
+        base = jnp.broadcast_to(jnp.asarray(scene.base.height), scene.grid.shape)
+        deep = jnp.maximum(deep, jnp.max(jnp.abs(lax.stop_gradient(base))))
+    return Bed(dx, drop, rim, base, deep, scene.grid.neighbours)
 
 
 def rim_of(shape: tuple[int, ...], level: Float[Array, ""]) -> Rim:
@@ -84,6 +95,13 @@ def unmark(height: Float[Array, "H W"], original: Float[Array, "H W"]) -> Float[
 def spoiled(before: Float[Array, "H W"], after: Float[Array, "H W"]) -> Bool[Array, ""]:
     """Whether a computation made NaN of a cell with sand, or an infinity; both maps are marked."""
     return jnp.any((jnp.isnan(after) != jnp.isnan(before)) | jnp.isinf(after))
+
+
+def below_base(bed: Bed, height: Float[Array, "H W"]) -> Bool[Array, ""]:
+    """Whether a marked map lies below the floor somewhere, by more than rounding."""
+    if bed.base is None:
+        return jnp.zeros((), bool)
+    return jnp.any(height < bed.base - 1e-6 * bed.spacing)
 
 
 def sound(bed: Bed) -> Bool[Array, ""]:

@@ -18,6 +18,7 @@ from jaxsand.relaxation.ghost_cells import (
     Bed,
     Lost,
     at,
+    below_base,
     halo,
     largest,
     mark,
@@ -85,7 +86,7 @@ def settle(
     height, the angle of repose and the spacing, with the number of sweeps held fixed.
 
     Args:
-        scene: grid, material, walls and edge; its tool plays no part.
+        scene: grid, material, walls, edge and floor; its tool plays no part.
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx. Use `jax.vmap` or
             `settle_batch` for many.
         scheme: `SuperTimeStepping` (the default), `Multilevel`, `Relaxation` or `Pairwise`.
@@ -170,7 +171,7 @@ def steepest_slope(scene: Scene, height: Float[ArrayLike, "H W"]) -> Float[Array
     """The steepest slope of a map, as the scene's neighbourhood measures slopes.
 
     With 4 or 8 neighbours it is max |h_j - h_i| / (l dx) over all links, l dx the distance of the cells; for isotropic sand
-    it is the largest length of a one-sided gradient. Differentiable in the height and the spacing where one slope alone is
+    it is the largest length of a one-sided gradient. Of bare floor (`Base`) slopes do not count. Differentiable in the height and the spacing where one slope alone is
     the steepest.
 
     Args:
@@ -220,6 +221,7 @@ def _judge(
     broken = broken | spoiled(marked, at(u)) | ~sound(bed)
     still = said(Outcome.NOT_STILL, residual > stop.tolerance)
     outcome = still | said(Outcome.WINDOW_EDGE, touched) | said(Outcome.NOT_FINITE, broken)
+    outcome = outcome | said(Outcome.BELOW_BASE, below_base(bed, marked))
     settled = unmark(at(u), height)
     return Settled(settled, sweeps, lax.stop_gradient(residual), outcome, volume_lost(bed, lost))
 

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
+from jaxsand.scene.boundaries import Base
 from jaxsand.scene.scene import Scene, as_array, check_scene, check_window
 from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
@@ -26,7 +27,9 @@ class Outcome(IntFlag):
         NOT_FINITE: the map, the stroke or the scene holds a NaN or an infinity, heights overflowed, or the stroke lies
             farther away than floats resolve or leads straight up or down. A bad cell of the map was treated as solid and is
             returned as it was.
-        NOT_POURED: less sand was poured than asked for: the bucket held less, or no cell with sand lies where it was poured.
+        NOT_POURED: less sand was poured, or removed, than asked for: the bucket or the bed held less, or no cell with sand
+            lies where it was poured.
+        BELOW_BASE: the map lies below the scene's floor somewhere. No sand lies there, and it was left as it is.
 
     Example:
         >>> import jaxsand as js
@@ -40,6 +43,7 @@ class Outcome(IntFlag):
     WINDOW_EDGE = 2
     NOT_FINITE = 4
     NOT_POURED = 8
+    BELOW_BASE = 16
 
 
 def said(outcome: Outcome, yes: Bool[Array, "..."]) -> Int[Array, "..."]:
@@ -139,6 +143,10 @@ def _check_scheme(scene: Scene, scheme: Scheme) -> None:
             if not (isinstance(value, int | float) and 1e-4 <= value <= most):
                 raise ValueError(f"scheme.{name}: got {value!r}; give a number from 1e-4 to {most}")
         if isinstance(scheme, Multilevel):
+            if isinstance(scene.base, Base):
+                raise ValueError(
+                    "scheme: got Multilevel on a Base, whose coarse grids know no floor; give SuperTimeStepping()"
+                )
             check_whole("scheme.coarsest", scheme.coarsest, 2)
             if not (isinstance(scheme.handover, int | float) and 1 <= scheme.handover < float("inf")):
                 raise ValueError(f"scheme.handover: got {scheme.handover!r}; give a time of at least 1, such as 128")

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Plain, Tree, split
 from jaxsand.relaxation import flux_adjoint
+from jaxsand.relaxation.floor import held, no_more_than
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
 
@@ -29,13 +30,21 @@ def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: Ghosted, lost: Los
 
     `lost` adds up the height that each cell lost over a draining rim (see `lose`); it is None where the edge is closed.
     """
-    return apply(bed, flow, counted(flow, fluxes(bed, around, u)), u, lost)
+    moved = within(bed, flow, counted(flow, fluxes(bed, around, u)), at(u))
+    return apply(bed, flow, moved, u, lost)
 
 
 def counted(flow: Flow, driven: Fluxes) -> Fluxes:
     """The numbers of quanta that cross the links in a sweep, from the fluxes at rate 1."""
     scale = flow.rate / flow.quantum
     return lax.optimization_barrier(tuple(truncate(f * scale) for f in driven))
+
+
+def within(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"]) -> Fluxes:
+    """The numbers of quanta that cross the links, of which no cell of a map [H, W] gives more than lies on its floor."""
+    if bed.base is None:
+        return moved
+    return lax.optimization_barrier(no_more_than(bed.neighbours, held(h, bed.base, flow.quantum), moved))
 
 
 def surge(
@@ -48,7 +57,7 @@ def surge(
     u, lost, last = state
     scale = flow.rate / flow.quantum
     moved = tuple(truncate(f * scale) + truncate(m * momentum) for f, m in zip(fluxes(bed, around, u), last, strict=True))
-    moved = lax.optimization_barrier(moved)
+    moved = within(bed, flow, lax.optimization_barrier(moved), at(u))
     u, lost = apply(bed, flow, moved, u, lost)
     return u, lost, moved
 
@@ -82,9 +91,9 @@ class Sweep(Plain):
         record: tuple[jax.Array, Lost],
         cotangent: tuple[jax.Array, Lost],
     ) -> tuple[Tree, tuple[jax.Array, Lost]]:
-        """The vjp, with 4 or 8 neighbours and a closed edge by the formulas of flux_adjoint.py, else by JAX."""
+        """The vjp, with 4 or 8 neighbours, a closed edge and no floor by the formulas of flux_adjoint.py, else by JAX."""
         bed, flow, around = params
-        if bed.neighbours == "isotropic" or bed.rim is not None:
+        if not bed.by_links:
             return super().pull(params, k, record, cotangent)
         h, gain = at(record[0]), at(cotangent[0])
         s = record[0] if isinstance(around, Nothing) else halo(around.surface(h))

@@ -1,4 +1,4 @@
-"""What bounds the sand: solid cells inside the map, and the map's edge."""
+"""What bounds the sand: solid cells inside the map, the map's edge, and the floor under it."""
 
 from dataclasses import dataclass
 
@@ -77,3 +77,43 @@ class Draining:
     """
 
     level: Float[Array, ""] | float = 0.0
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Deep:
+    """The sand is deeper than any tool reaches: a bed without a floor, the default of `make_scene`.
+
+    Example:
+        >>> import jaxsand as js
+        >>> js.make_scene((8, 8), 0.01).base
+        Deep()
+    """
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Base:
+    """A floor under the sand: a tray's bottom, rock, concrete. No tool cuts it.
+
+    In each cell the sand is h - base thick, 0 or more. Over a link flows no more than there is: if the fluxes that leave a
+    cell sum to more than its thickness, all are reduced in proportion. The floor itself may be steeper than repose; bare, it
+    is still. Sand thinner than 1e-4 spacings counts as none when slopes are judged. Where the map lies below the floor there
+    is no sand, and outcomes say BELOW_BASE.
+
+    Attributes:
+        height: height of the floor (m): one number, or a map [H, W]. Differentiable.
+
+    Example:
+        A tray 2 cm deep: a heap slides off a slope of bare rock.
+
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> rock = jnp.broadcast_to(0.01 * jnp.maximum(jnp.arange(8.0) - 3, 0), (8, 8))
+        >>> scene = js.make_scene((8, 8), 0.01, base=js.Base(rock))
+        >>> settled = js.settle(scene, rock.at[4, 6].add(0.01))
+        >>> print(f"{settled.height[4, 6] - rock[4, 6]:.6f} {js.volume(scene, settled.height - rock):.1e}")
+        0.000000 1.0e-06
+    """
+
+    height: Float[Array, ""] | Float[Array, "H W"]

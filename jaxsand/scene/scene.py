@@ -11,7 +11,7 @@ import numpy.typing as npt
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-from jaxsand.scene.boundaries import Closed, Draining, Open, Walls
+from jaxsand.scene.boundaries import Base, Closed, Deep, Draining, Open, Walls
 from jaxsand.scene.grid import Grid, Neighbours
 from jaxsand.scene.masked import BED, unmasked
 from jaxsand.scene.material import DRY_SAND, Material
@@ -37,6 +37,7 @@ class Scene:
         edge: `Closed`, or `Draining` with sand running off over the map's edge.
         window: which part of the map is computed: `AsNeeded`, `Whole` or `Window`.
         tool: `NoTool`, `Blade`, `Wheel`, or another `Tool`.
+        base: `Deep`, or `Base` with a floor under the sand.
 
     Example:
         A batch of scenes with three angles of repose, each with its own map:
@@ -58,6 +59,7 @@ class Scene:
     edge: Closed | Draining = field(default_factory=Closed)
     window: AsNeeded | Whole | Window = field(default_factory=AsNeeded)
     tool: Tool = field(default_factory=NoTool)
+    base: Deep | Base = field(default_factory=Deep)
 
 
 def make_scene(
@@ -70,6 +72,7 @@ def make_scene(
     walls: Open | Walls | None = None,
     edge: Closed | Draining | None = None,
     window: AsNeeded | Whole | Window | None = None,
+    base: Deep | Base | None = None,
 ) -> Scene:
     """Builds a scene and checks every value in it.
 
@@ -83,6 +86,7 @@ def make_scene(
         walls: `Walls` with solid cells; None for none.
         edge: `Draining` where sand runs off over the map's edge; None for a closed edge.
         window: `Window` or `Whole`, the part of the map that is computed; None for `AsNeeded`.
+        base: `Base`, a floor under the sand; None for a bed deeper than any tool reaches.
 
     Returns:
         The scene, for `settle`, `step` and the other functions of this package.
@@ -116,9 +120,11 @@ def make_scene(
         Closed() if edge is None else edge,
         AsNeeded() if window is None else window,
         NoTool() if tool is None else tool,
+        Deep() if base is None else _as_base(base),
     )
     _check_walls(scene.walls, shape)
     _check_edge(scene.edge)
+    _check_base(scene.base, shape)
     check_window(scene.window, shape)
     if isinstance(scene.tool, type) or not isinstance(scene.tool, Tool):
         raise ValueError(
@@ -135,6 +141,14 @@ def blade_of(scene: Scene) -> Blade:
         raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
     square(scene.tool)
     return scene.tool
+
+
+def deep(scene: Scene, push: str) -> None:
+    """Raises ValueError if a floor lies under the sand, which the push named `push` does not know."""
+    if isinstance(scene.base, Base):
+        raise ValueError(
+            f"push: got {push} on a Base, which it does not know; give SteppedPush(), or make_scene without base"
+        )
 
 
 def volume(scene: Scene, height: Float[ArrayLike, "H W"]) -> Float[Array, ""]:
@@ -268,6 +282,26 @@ def _check_edge(edge: object) -> None:
         finite("edge.level", edge.level, "give the height of the rim in metres")
     elif not isinstance(edge, Closed):
         raise ValueError(f"edge: got {edge!r}; give Closed() or Draining(level)")
+
+
+def _as_base(base: Deep | Base) -> Deep | Base:
+    if not isinstance(base, Base):
+        return base
+    height = unmasked("base.height", base.height, "give every cell a floor, however deep")
+    return Base(_number(height) if np.ndim(height) == 0 or hasattr(height, "dtype") else jnp.asarray(height))
+
+
+def _check_base(base: object, shape: tuple[int, int]) -> None:
+    if isinstance(base, Base):
+        height = concrete(base.height)
+        if height is not None and height.shape not in ((), shape):
+            remedy = f"give one number or a map of shape {list(shape)}"
+            raise ValueError(f"base.height: got shape {list(height.shape)}; {remedy}")
+        if height is not None and not np.all(np.isfinite(height)):
+            raise ValueError("base.height: got a number that is not finite; give metres, such as -0.06")
+    elif not isinstance(base, Deep):
+        got = type(base).__name__ if hasattr(base, "shape") else repr(base)
+        raise ValueError(f"base: got {got}; give Deep() or Base(height)")
 
 
 def check_window(window: object, shape: tuple[int, int]) -> None:
