@@ -171,8 +171,8 @@ def steepest_slope(scene: Scene, height: Float[ArrayLike, "H W"]) -> Float[Array
     """The steepest slope of a map, as the scene's neighbourhood measures slopes.
 
     With 4 or 8 neighbours it is max |h_j - h_i| / (l dx) over all links, l dx the distance of the cells; for isotropic sand
-    it is the largest length of a one-sided gradient. Of bare floor (`Base`) slopes do not count. Differentiable in the height and the spacing where one slope alone is
-    the steepest.
+    it is the largest length of a one-sided gradient. Of bare floor (`Base`) slopes do not count. Differentiable in the
+    height and the spacing where one slope alone is the steepest.
 
     Args:
         scene: spacing, neighbours and walls.
