@@ -187,7 +187,10 @@ class Advance(Step):
             along, across = self.block.coordinates(frame, first)
             side, half = spread(way.side, across), spread(way.half, along)
             beside = lax.optimization_barrier(blade.share(across, -side, side))
-            return blade.straight(along - spread(begin, along), beside, half, spread(ahead, along))
+            reach = blade.straight(along - spread(begin, along), beside, half, spread(ahead, along))
+            if way.plates is None:
+                return reach
+            return blade.boxed(reach, across, half, side, spread(way.plates, along), spread(ahead, along))
         yaw = frame.mirrors(way.yaw)
         frame = replace(frame, pose=rotated(frame.pose, yaw))
         along, across = self.block.coordinates(frame, first)

@@ -42,6 +42,8 @@ class Reach:
         beside: share that lies between the blade's two ends, afterwards.
         along: distance of each cell from the blade's middle plane afterwards, positive ahead (spacings).
         gone: distance by which the blade moves at each cell (spacings).
+        plates: of a blade with plates, how far outside the plates' middles each cell lies, afterwards (spacings), and the
+            share of it that lies between the plates' two ends.
     """
 
     before: jax.Array
@@ -50,6 +52,7 @@ class Reach:
     beside: jax.Array
     along: jax.Array
     gone: jax.Array
+    plates: tuple[jax.Array, jax.Array] | None = None
 
 
 def share(s: jax.Array, start: jax.Array, stop: jax.Array) -> jax.Array:
@@ -71,6 +74,26 @@ def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Ar
     after = _to(along + half - ahead) - front_after
     gone = jnp.broadcast_to(ahead, along.shape)
     return Reach(beside * (rear - front), beside * (rear - front_after), beside * after, beside, along - ahead, gone)
+
+
+def boxed(reach: Reach, across: jax.Array, half: jax.Array, side: jax.Array, plates: jax.Array, ahead: jax.Array) -> Reach:
+    """The footprints of a blade whose ends carry plates a cell thick, which reach `plates` ahead of its face (spacings).
+
+    `reach` are the footprints without them, of a blade that moves straight ahead.
+    """
+    beside = share(across, side, side + 1) + share(across, -side - 1, -side)
+    rear, front = _to(reach.along + ahead + half), _to(reach.along + ahead - half - plates)
+    front_after = _to(reach.along - half - plates)
+    long = _to(reach.along + half) - front_after
+    return Reach(
+        reach.before + beside * (rear - front),
+        reach.swept + beside * (rear - front_after),
+        reach.after + beside * long,
+        share(across, -side - 1, side + 1),
+        reach.along,
+        reach.gone,
+        (jnp.abs(across) - side - 0.5, long),
+    )
 
 
 def slanted(
@@ -153,16 +176,21 @@ def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.A
     """The open share of each cell and of each link, after the blade has moved; `holds` is 1 for cells that can hold sand.
 
     A link is as open as the narrower of its two cells, times 2 / (1 + narrower / wider). Where the blade's middle plane cuts
-    the link, the narrower counts at most as what the plane leaves open. Maps of cells have ghost cells.
+    the link, the narrower counts at most as what the plane leaves open; so do the planes of plates. Maps of cells have
+    ghost cells.
     """
     # New ghost cells store the footprint, which XLA would else compute anew for both ends of every link.
     free = (1 - outer(inner(reach.after))) * holds
     out = []
-    of_links = (both_ends(neighbours, x) for x in (free, lax.stop_gradient(reach.along), reach.beside))
-    for (here, there), (behind, before), beside in zip(*of_links, strict=True):
+    planes = [(reach.along, reach.beside), *(() if reach.plates is None else (reach.plates,))]
+    of_planes = [
+        zip(both_ends(neighbours, lax.stop_gradient(way)), both_ends(neighbours, wide), strict=True) for way, wide in planes
+    ]
+    for (here, there), *cuts in zip(both_ends(neighbours, free), *of_planes, strict=True):
         low, high = jnp.minimum(here, there), jnp.maximum(here, there)
-        cut = jnp.minimum(*beside)
-        narrow = jnp.where(behind * before < 0, jnp.minimum(low, 1 - cut), low)
+        narrow = low
+        for (behind, before), wide in cuts:
+            narrow = jnp.where(behind * before < 0, jnp.minimum(narrow, 1 - jnp.minimum(*wide)), narrow)
         out.append(narrow * (2 * high / jnp.maximum(low + high, _LEAST)))
     return free, lax.optimization_barrier(tuple(out))
 

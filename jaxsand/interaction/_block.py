@@ -41,6 +41,7 @@ class Way:
         yaw: angle from the direction of travel to the blade's normal (rad), or None if it stands square to its way.
         room: sum of heights that the tool's bucket can take up from the path's start on (quanta), or None if it has none.
         base: height of the floor under the sand, a flat map [cells] (m), or None if there is none.
+        plates: how far plates reach ahead of the blade's face, or None if it has none.
     """
 
     start: Pose
@@ -58,6 +59,7 @@ class Way:
     room: jax.Array | None = None
     yaw: jax.Array | None = None
     base: jax.Array | None = None
+    plates: jax.Array | None = None
 
     def at(self, by: jax.Array) -> "Way":
         """The leg as it is when the blade has moved by a length (spacings): with its bottom at the height there."""

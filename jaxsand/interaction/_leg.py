@@ -127,7 +127,7 @@ def _turned(
 def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.Array, side: jax.Array) -> Way:
     """A leg in spacings, of a tool that reaches by `half` ahead and by `side` aside (spacings); see `Way`."""
     dx, drop, rim = job.bed.spacing, job.bed.drop, job.bed.rim
-    yaw = job.tool.yaw if isinstance(job.tool, Blade) else None
+    yaw, plates = (job.tool.yaw, job.tool.plates) if isinstance(job.tool, Blade) else (None, None)
     return Way(
         _in_spacings(pose, dx),
         length / dx,
@@ -144,6 +144,7 @@ def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.
         None if job.room is None else job.room / job.flow.quantum,
         None if yaw is None else jnp.asarray(yaw),
         None if job.bed.base is None else job.bed.base.reshape(-1),
+        None if plates is None else plates / dx,
     )
 
 

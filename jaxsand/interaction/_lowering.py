@@ -31,7 +31,10 @@ class Lower(Step):
         holds, old = self.block.part(view.holds), self.block.part(whole)
         along, across = self.block.coordinates(frame, first)
         beside = blade.share(across, -way.side, way.side)
-        cover = inner(blade.straight(along, beside, way.half, jnp.zeros_like(way.length)).after)
+        reach = blade.straight(along, beside, way.half, jnp.zeros_like(way.length))
+        if way.plates is not None:
+            reach = blade.boxed(reach, across, way.half, way.side, way.plates, jnp.zeros_like(way.length))
+        cover = inner(reach.after)
         along, across = inner(along), inner(across)
         bottom = self.block.above(view, way.bottom / way.quantum)
         taken = truncate(cover * jnp.maximum(old - bottom, 0)) * at(holds)

@@ -35,7 +35,7 @@ from jaxsand.interaction._path import Pushed, Record, State, along_legs, heading
 from jaxsand.interaction._turning import Turn
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade, Pose
+from jaxsand.scene.tools import Blade, Number, Pose
 from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import AsNeeded, Window
 
@@ -108,7 +108,7 @@ def _leg(
         near = min(size, scene.window.near or size)
     block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, job.bed.rim is not None)
     if near < size:  # a traced blade may be larger than the one for which the window was made
-        far = lax.stop_gradient(_far(job.tool.width / dx, job.tool.thickness / dx))
+        far = lax.stop_gradient(_far(*(size / dx for size in _body(job.tool, dx))))
         state = replace(state, moved=jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, state.moved))
 
     def way(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
@@ -136,7 +136,7 @@ def with_near(scene: Scene) -> Scene:
     """The scene with its window's `near` set, if it has a window and the blade's size is known."""
     if not (isinstance(scene.window, Window) and isinstance(scene.tool, Blade)):
         return scene
-    known = _known(scene.tool.width, scene.tool.thickness, scene.grid.spacing)
+    known = _known(*_body(scene.tool, scene.grid.spacing), scene.grid.spacing)
     if known is None:
         return scene
     width, thickness, dx = known
@@ -152,6 +152,13 @@ def _known(*leaves: ArrayLike) -> list[float] | None:
     if any(x is None or x.ndim for x in found):
         return None
     return [float(x) for x in found if x is not None]
+
+
+def _body(tool: Blade, spacing: Number) -> tuple[Number, Number]:
+    """The width and the thickness (m) of the smallest blade without plates that covers this one."""
+    if tool.plates is None:
+        return tool.width, tool.thickness
+    return tool.width + 2 * spacing, tool.thickness + 2 * tool.plates
 
 
 def _far(width: Length, thickness: Length) -> Length:
@@ -174,7 +181,7 @@ def windows_for(scene: Scene, times: float = 1) -> Iterator[Scene]:
     """
     if not (isinstance(scene.window, AsNeeded) and isinstance(scene.tool, Blade)):
         return
-    known = _known(scene.tool.width, scene.tool.thickness, scene.tool.depth, scene.grid.spacing)
+    known = _known(*_body(scene.tool, scene.grid.spacing), scene.tool.depth, scene.grid.spacing)
     angle = concrete(scene.material.repose_angle)
     if angle is None or known is None:
         return

@@ -136,7 +136,7 @@ def make_scene(
 
 
 def blade_of(scene: Scene) -> Blade:
-    """The scene's blade; raises ValueError if its tool is another, or the blade does not stand square to its way."""
+    """The scene's blade; raises ValueError if its tool is another, or the blade stands at an angle or has plates."""
     if not isinstance(scene.tool, Blade):
         raise ValueError(f"scene.tool: got {type(scene.tool).__name__}; give make_scene(..., tool=Blade()) to push with")
     square(scene.tool)

@@ -66,12 +66,17 @@ class Blade:
     the left where it is positive. What the blade covers leaves along its normal, turned towards the way by the angle of
     repose at most, as sand that slides on sand would.
 
+    A blade with plates, a box blade, carries its heap instead of spilling it to the sides, as long as the heap's toe lies
+    between the plates: V / w of it (m^2) has its toe sqrt(2 V / (w mu)) ahead. A plate is a cell thick and as deep as the
+    blade; it stands beside the blade's end. While the blade turns in place, its plates are up.
+
     Attributes:
         width: extent along its face (m), at least one cell.
         thickness: extent along its normal (m), at least one cell.
         depth: depth of the bottom edge below height 0 (m).
         yaw: angle from the direction of travel to the blade's normal (rad), counter-clockwise, -pi/3 to pi/3; None for a
             blade that stands square to its way, which costs nothing.
+        plates: how far plates at its two ends reach ahead of its face (m), for a blade that stands square; None without.
 
     Example:
         >>> import jaxsand as js
@@ -84,6 +89,7 @@ class Blade:
     thickness: Number = 0.015
     depth: Number = 0.0075
     yaw: Number | None = None
+    plates: Number | None = None
 
     def check(self, grid: Grid) -> None:
         """Raises ValueError if a length or the angle is out of range, or a length less than a cell; see `Tool`."""
@@ -95,6 +101,11 @@ class Blade:
             yaw = concrete(self.yaw)
             if yaw is not None and abs(yaw) > MOST_YAW * (1 + 1e-6):
                 raise ValueError(f"tool.yaw: got {self.yaw!r} rad; give -pi/3 to pi/3: for degrees use math.radians(30)")
+        if self.plates is not None:
+            positive("tool.plates", self.plates, "give how far the plates reach ahead in metres, or None")
+            _within_the_map({"plates": self.plates}, grid)
+            if self.yaw is not None:
+                raise ValueError("tool.yaw: got an angle and plates; a blade with plates stands square, so give yaw=None")
         thickness, dx = concrete(self.thickness), concrete(grid.spacing)
         if thickness is None or dx is None:
             return
@@ -253,9 +264,11 @@ def _within_the_map(sizes: dict[str, Number], grid: Grid) -> None:
 
 
 def square(blade: Blade) -> None:
-    """Raises ValueError unless the blade stands square to its way."""
+    """Raises ValueError unless the blade stands square to its way and has no plates."""
     if blade.yaw is not None:
         raise ValueError(f"scene.tool.yaw: got {short(blade.yaw)}; give a blade that stands square to its way, yaw=None")
+    if blade.plates is not None:
+        raise ValueError(f"scene.tool.plates: got {short(blade.plates)}; give a blade without, plates=None")
 
 
 def lowest(tool: Blade | Wheel) -> Scalar:
@@ -273,6 +286,8 @@ def usable(tool: Tool) -> Bool[Array, ""]:
         good = good & (jnp.abs(tool.slip_angle) <= math.pi / 2 * (1 + 1e-6))
     if isinstance(tool, Blade) and tool.yaw is not None:
         good = good & (jnp.abs(tool.yaw) <= MOST_YAW * (1 + 1e-6))
+    if isinstance(tool, Blade) and tool.plates is not None:
+        good = good & (tool.plates >= 0)
     return good
 
 
@@ -304,7 +319,7 @@ def reach(tool: Blade | Wheel) -> Scalar:
         return jnp.hypot(tool.radius, jnp.asarray(tool.width) / 2)
     if tool.yaw is not None:
         return jnp.hypot(tool.thickness, jnp.asarray(tool.width)) / 2
-    return jnp.asarray(tool.thickness) / 2
+    return jnp.asarray(tool.thickness) / 2 + (0 if tool.plates is None else tool.plates)
 
 
 @jax.tree_util.register_dataclass
