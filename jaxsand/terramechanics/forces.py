@@ -1,4 +1,4 @@
-"""Forces of the sand on a blade and on a wheel: an optional layer that reads a scene and never changes it.
+"""Forces of the sand on tools: an optional layer that reads a scene and never changes it.
 
 Blade: the fundamental equation of earthmoving. A wedge of soil between the blade's face (rake a from the horizontal), the
 level surface and a plane failure surface (angle b) slides up; its limit equilibrium gives the force
@@ -6,72 +6,42 @@ F = w (g d^2 N_g + c d N_c + c_a d N_ca + q d N_q), and the soil fails at the an
 (doi:10.1243/PIME_CONF_1964_179_134_02), McKyes 1985, "Soil Cutting and Tillage". Sides of the wedge: after Perumpral,
 Grisso & Desai 1983, "A soil-tool model based on limit equilibrium analysis", Trans. ASAE 26(4).
 
-Wheel: the pressure-sinkage relation of Bekker 1956, "Theory of Land Locomotion", and the shear of Janosi & Hanamoto 1961,
-integrated over the contact of a rigid wheel as in Wong & Reece 1967, J. Terramechanics 4.
+Wheel: see `jaxsand.scene.bearing`, whose names are here too, and those of `jaxsand.scene.soil`.
 
 The forces are quasi-static. All functions take scalars and work under jit, grad and vmap; traced values are not checked.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxsand.scene.bearing import WheelForce, bekker_resistance, bekker_sinkage, wheel_force, wheel_sinkage
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, cast, fit
+from jaxsand.scene.soil import LETE_SAND, TINY, WONG_DRY_SAND, Scalar, Soil, check_number, check_soil
 from jaxsand.scene.tools import Blade, Pose, coverage, square
 from jaxsand.scene.validation import concrete
 
-Scalar = jax.Array | float
-_TINY = float(np.finfo(np.float32).tiny)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Soil:
-    """The strength of a soil (Mohr-Coulomb), its hold on a blade, and how it yields under a wheel (Bekker, Janosi-Hanamoto).
-
-    Args:
-      unit_weight: g, density times gravity (N/m^3).
-      friction: phi, angle of internal friction (rad).
-      cohesion: c (Pa).
-      interface_friction: delta, angle of friction of the soil on the blade (rad).
-      adhesion: c_a, of the soil to the blade (Pa).
-      cohesive_modulus: k_c of Bekker's pressure-sinkage relation (N/m^(n+1)).
-      frictional_modulus: k_phi of the same relation (N/m^(n+2)).
-      exponent: n, of the sinkage in the same relation.
-      shear_displacement: K, the length over which shear stress builds up (m).
-
-    Example:
-      >>> import jaxsand as js
-      >>> import dataclasses
-      >>> clean = dataclasses.replace(js.forces.WONG_DRY_SAND, cohesion=0.0)
-      >>> clean.cohesion
-      0.0
-    """
-
-    unit_weight: Scalar  # g: density times gravity, N/m^3
-    friction: Scalar  # phi: angle of internal friction, rad
-    cohesion: Scalar  # c, Pa
-    interface_friction: Scalar  # delta: angle of friction of the soil on the blade, rad
-    adhesion: Scalar  # c_a: of the soil to the blade, Pa
-    cohesive_modulus: Scalar  # k_c, N/m^(n+1)
-    frictional_modulus: Scalar  # k_phi, N/m^(n+2)
-    exponent: Scalar  # n, of the sinkage
-    shear_displacement: Scalar  # K, over which shear builds up, m
-
-
-WONG_DRY_SAND = Soil(15.7e3, math.radians(28), 1.04e3, math.radians(28) * 2 / 3, 0.0, 0.99e3, 1528.43e3, 1.1, 0.025)
-"""Dry sand of Wong, "Theory of Ground Vehicles" (n, k_c, k_phi, c, phi); K of the loose sand in Project Chrono's demos.
-
-Assumed, not from there: 1600 kg/m^3, two thirds of phi on the blade, no adhesion. The cohesion outweighs the rest in cuts of
-centimetres; `dataclasses.replace(soil, cohesion=0.0)` leaves a clean dry sand."""
-
-LETE_SAND = Soil(15.7e3, math.radians(31.1), 1.3e3, math.radians(31.1) * 2 / 3, 0.0, 102e3, 5301e3, 0.793, 0.012)
-"""LETE sand (n, k_c, k_phi, c, phi, K) as in Project Chrono's demos of soft terrain; the rest assumed as above."""
+__all__ = [
+    "LETE_SAND",
+    "WONG_DRY_SAND",
+    "BladeForce",
+    "Cut",
+    "Soil",
+    "WheelForce",
+    "bekker_resistance",
+    "bekker_sinkage",
+    "blade_force",
+    "cut_force",
+    "failure_angle",
+    "wedge_factors",
+    "wheel_force",
+    "wheel_sinkage",
+]
 
 
 @jax.tree_util.register_dataclass
@@ -117,30 +87,6 @@ class BladeForce:
 
     draught: jax.Array
     lift: jax.Array
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class WheelForce:
-    """The forces of the soil on a driven wheel.
-
-    Attributes:
-      load: carried (N).
-      pull: drawbar pull (N), the shear thrust less the resistance.
-      torque: on the axle (N m).
-      resistance: compaction resistance (N).
-
-    Example:
-      >>> import jaxsand as js
-      >>> force = js.forces.wheel_force(js.forces.WONG_DRY_SAND, 0.048, 0.05, sinkage=0.01, slip=0.2)
-      >>> bool(force.load > force.resistance > 0)
-      True
-    """
-
-    load: jax.Array
-    pull: jax.Array
-    torque: jax.Array
-    resistance: jax.Array
 
 
 def wedge_factors(soil: Soil, rake: Scalar, angle: Scalar) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
@@ -231,12 +177,14 @@ def cut_force(soil: Soil, cut: Cut) -> BladeForce:
       >>> bool(deep.draught > 2 * shallow.draught)
       True
     """
-    _check_soil(soil)
-    _check("cut.width", cut.width, _TINY, np.inf, "give metres")
+    check_soil(soil)
+    check_number("cut.width", cut.width, TINY, np.inf, "give metres")
     for name in ("depth", "surcharge", "sides"):
-        _check(f"cut.{name}", getattr(cut, name), 0, 2 if name == "sides" else np.inf, "give metres below the surface, Pa")
+        check_number(
+            f"cut.{name}", getattr(cut, name), 0, 2 if name == "sides" else np.inf, "give metres below the surface, Pa"
+        )
     held = sum(float(a) for a in map(concrete, (soil.friction, soil.interface_friction)) if a is not None)
-    _check("cut.rake", cut.rake, _TINY, math.pi - held - 1e-6, "pi less both angles of friction locks the wedge")
+    check_number("cut.rake", cut.rake, TINY, math.pi - held - 1e-6, "pi less both angles of friction locks the wedge")
     area = jnp.asarray(cut.depth) * cut.width
     force, stuck = area * _stress(soil, cut, failure_angle(soil, cut)), area * soil.adhesion
     out = cut.rake + soil.interface_friction
@@ -283,111 +231,11 @@ def blade_force(scene: Scene, height: jax.typing.ArrayLike, pose: Pose, soil: So
     ahead = jnp.asarray(blade.thickness) / 2 + 1.5 * dx
     middle = Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin)
     share = coverage(Blade(blade.width, dx), middle, *centres(scene.grid, height.dtype), dx)
-    share /= jnp.maximum(jnp.sum(share), _TINY)
+    share /= jnp.maximum(jnp.sum(share), TINY)
     bottom = -jnp.asarray(blade.depth)
     depth = jnp.sum(share * jnp.maximum(jnp.minimum(height, level) - bottom, 0))
     heap = jnp.sum(share * jnp.maximum(height - jnp.maximum(level, bottom), 0))
     return cut_force(soil, Cut(depth, blade.width, surcharge=heap * soil.unit_weight, sides=2.0))
-
-
-def wheel_force(soil: Soil, radius: Scalar, width: Scalar, sinkage: Scalar, slip: Scalar) -> WheelForce:
-    """The forces of the soil on a driven rigid wheel at a given sinkage and slip.
-
-    The contact runs from the entry angle t_1 = acos(1 - z / r) to the lowest point, t = 0. At the angle t,
-    p = (k_c / b + k_phi)(r (cos t - cos t_1))^n and tau = (c + p tan phi)(1 - e^(-j / K)), with the shear displacement
-    j = r (t_1 - t - (1 - slip)(sin t_1 - sin t)). Load and pull are the integrals over t of r b (p cos t + tau sin t) and of
-    r b (tau cos t - p sin t), the torque is that of r^2 b tau.
-
-    Args:
-      soil: the soil's strength.
-      radius: r (m).
-      width: b (m).
-      sinkage: z (m), 0 to r.
-      slip: 1 - speed / (r times rate), 0 to 1.
-
-    Returns:
-      A `WheelForce` (N, torque in N m), 0 at sinkage 0. Differentiable in all arguments.
-
-    Raises:
-      ValueError: for a value out of range.
-
-    Source: Bekker 1956, "Theory of Land Locomotion"; Janosi & Hanamoto 1961; Wong & Reece 1967, J. Terramechanics 4.
-
-    Example:
-      >>> import jaxsand as js
-      >>> soil = js.forces.WONG_DRY_SAND
-      >>> slipping = js.forces.wheel_force(soil, radius=0.048, width=0.05, sinkage=0.01, slip=0.5)
-      >>> gripping = js.forces.wheel_force(soil, radius=0.048, width=0.05, sinkage=0.01, slip=0.1)
-      >>> bool(slipping.pull > gripping.pull)
-      True
-    """
-    _check_soil(soil)
-    _check("radius", radius, _TINY, np.inf, "give metres")
-    _check("width", width, _TINY, np.inf, "give metres")
-    _check("sinkage", sinkage, 0, np.inf if concrete(radius) is None else radius, "give metres, at most the radius")
-    _check("slip", slip, 0, 1, "give 1 - speed / (radius * rate) of a driven wheel")
-    touches = jnp.asarray(sinkage) > 0
-    entry = 2 * jnp.arcsin(jnp.sqrt(jnp.where(touches, sinkage, radius) / (2 * jnp.asarray(radius))))
-    nodes, weights = (jnp.asarray(a, entry.dtype) for a in np.polynomial.legendre.leggauss(40))
-    root = (1 + nodes) / 2  # t = t_1 (1 - root^2) smooths p^n at the entry
-    t, dt = entry * (1 - root**2), entry * root * weights
-    below = 2 * radius * jnp.sin((entry + t) / 2) * jnp.sin((entry - t) / 2)
-    pressure = (soil.cohesive_modulus / width + soil.frictional_modulus) * below**soil.exponent
-    slid = radius * (entry - t - (1 - slip) * (jnp.sin(entry) - jnp.sin(t))) / soil.shear_displacement
-    shear = (soil.cohesion + pressure * jnp.tan(soil.friction)) * -jnp.expm1(-slid)
-    parts = jnp.stack([pressure * jnp.cos(t), pressure * jnp.sin(t), shear * jnp.cos(t), shear * jnp.sin(t), shear])
-    normal, resistance, thrust, held, turned = jnp.where(touches, radius * width * (parts @ dt), 0)
-    return WheelForce(normal + held, thrust - resistance, radius * turned, resistance)
-
-
-def bekker_sinkage(soil: Soil, radius: Scalar, width: Scalar, load: Scalar) -> jax.Array:
-    """The sinkage of a rigid wheel under a load, without shear.
-
-    z = (3 W / (b (3 - n) k sqrt(D)))^(2 / (2 n + 1)) with k = k_c / b + k_phi and D = 2 r, for z small beside D. The factor
-    (3 - n) / 3 is an approximation, exact for n = 1.
-
-    Args:
-      soil: the soil's strength.
-      radius: r (m).
-      width: b (m).
-      load: W (N).
-
-    Returns:
-      The sinkage z (m). Differentiable.
-
-    Source: Bekker 1956, "Theory of Land Locomotion".
-
-    Example:
-      >>> import jaxsand as js
-      >>> round(float(js.forces.bekker_sinkage(js.forces.WONG_DRY_SAND, radius=0.048, width=0.05, load=10.0)), 4)
-      0.0103
-    """
-    modulus = soil.cohesive_modulus + width * soil.frictional_modulus
-    return (3 * jnp.asarray(load) / ((3 - soil.exponent) * modulus * jnp.sqrt(2 * radius))) ** (2 / (2 * soil.exponent + 1))
-
-
-def bekker_resistance(soil: Soil, width: Scalar, sinkage: Scalar) -> jax.Array:
-    """The compaction resistance of a wheel: the work of pressing a rut one metre long.
-
-    R = b k z^(n + 1) / (n + 1) with k = k_c / b + k_phi.
-
-    Args:
-      soil: the soil's strength.
-      width: b (m).
-      sinkage: z (m).
-
-    Returns:
-      R (N). Differentiable.
-
-    Source: Bekker 1956, "Theory of Land Locomotion".
-
-    Example:
-      >>> import jaxsand as js
-      >>> round(float(js.forces.bekker_resistance(js.forces.WONG_DRY_SAND, width=0.05, sinkage=0.01)), 2)
-      2.33
-    """
-    modulus = soil.cohesive_modulus + width * soil.frictional_modulus
-    return modulus * jnp.asarray(sinkage) ** (soil.exponent + 1) / (soil.exponent + 1)
 
 
 def _stress(soil: Soil, cut: Cut, angle: jax.Array) -> jax.Array:
@@ -402,17 +250,3 @@ def _stress(soil: Soil, cut: Cut, angle: jax.Array) -> jax.Array:
     area = cut.depth / cut.width * (1 / jnp.tan(cut.rake) + 1 / jnp.tan(angle)) / 2
     plane = soil.unit_weight * cut.depth * weight + soil.adhesion * adhesion + cut.surcharge * surcharge
     return plane + (soil.cohesion + cut.sides * area * shear * jnp.sin(angle)) * cohesion
-
-
-def _check_soil(soil: Soil) -> None:
-    for name in (field.name for field in fields(soil)):
-        low = _TINY if name in ("exponent", "shear_displacement") else 0
-        high = {"friction": 1.57, "interface_friction": 1.57, "exponent": 3}.get(name, np.inf)
-        _check(f"soil.{name}", getattr(soil, name), low, high, "give SI units; for degrees use math.radians(30)")
-
-
-def _check(name: str, value: Scalar, low: float, high: Scalar, remedy: str) -> None:
-    array = concrete(value)
-    if array is not None and not (array.ndim == 0 and np.isfinite(array) and low <= array <= high):
-        least = "above" if low else "of at least"
-        raise ValueError(f"{name}: got {value!r}; give one finite number {least} 0, at most {high}: {remedy}")
