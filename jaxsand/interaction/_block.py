@@ -9,6 +9,7 @@ from jax import lax
 
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._frame import Frame, Places, cut, numbers, paste, places
+from jaxsand.interaction._ground import Relief
 from jaxsand.interaction.resting import Sand, where_open
 from jaxsand.interaction.stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation.flux import Fluxes
@@ -40,6 +41,7 @@ class Way:
         angle: angle by which the blade turns in place before the leg (rad).
         yaw: angle from the direction of travel to the blade's normal (rad), or None if it stands square to its way.
         room: sum of heights that the tool's bucket can take up from the path's start on (quanta), or None if it has none.
+        relief: how the ground rises and falls that the bottom follows, or None.
     """
 
     start: Pose
@@ -56,9 +58,12 @@ class Way:
     rise: jax.Array | None
     room: jax.Array | None = None
     yaw: jax.Array | None = None
+    relief: Relief | None = None
 
     def at(self, by: jax.Array) -> "Way":
         """The leg as it is when the blade has moved by a length (spacings): with its bottom at the height there."""
+        if self.relief is not None:
+            return replace(self, bottom=self.bottom + self.relief.at(by))
         return self if self.rise is None else replace(self, bottom=self.bottom + by * self.rise)
 
 

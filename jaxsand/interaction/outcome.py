@@ -34,6 +34,10 @@ _ADVICE = {
     Outcome.NOT_POURED: (
         "less sand was poured than asked for: ask for at most load_volume(scene, load), and pour onto cells with sand"
     ),
+    Outcome.NOT_CARRIED: (
+        "the soil does not carry the wheel before it stands in it up to its axle: lighten it, or give a larger wheel or a "
+        "firmer soil"
+    ),
 }
 
 

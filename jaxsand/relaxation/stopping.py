@@ -27,6 +27,8 @@ class Outcome(IntFlag):
             farther away than floats resolve or leads straight up or down. A bad cell of the map was treated as solid and is
             returned as it was.
         NOT_POURED: less sand was poured than asked for: the bucket held less, or no cell with sand lies where it was poured.
+        NOT_CARRIED: a wheel's load is more than the soil carries before the wheel stands in it up to its axle. The map is as
+            it was.
 
     Example:
         >>> import jaxsand as js
@@ -40,6 +42,7 @@ class Outcome(IntFlag):
     WINDOW_EDGE = 2
     NOT_FINITE = 4
     NOT_POURED = 8
+    NOT_CARRIED = 16
 
 
 def said(outcome: Outcome, yes: Bool[Array, "..."]) -> Int[Array, "..."]:
