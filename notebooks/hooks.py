@@ -19,7 +19,10 @@ ROOMS = {  # rooms of the package with public names, and what else is public in 
     "scene": ("Scene", ("jaxsand.scene.bearing", "jaxsand.scene.soil")),
     "relaxation": ("Relaxation", ()),
     "interaction": ("Interaction", ()),
-    "terramechanics": ("Terramechanics", ("jaxsand.terramechanics.forces", "jaxsand.terramechanics.wheel_trench")),
+    "terramechanics": (
+        "Terramechanics",
+        ("jaxsand.terramechanics.cutting", "jaxsand.terramechanics.force_trace", "jaxsand.terramechanics.wheel_trench"),
+    ),
     "goals": ("Goals", ("jaxsand.goals.metrics",)),
     "planning": ("Planning", ()),
     "envs": ("Environments", ("jaxsand.envs",)),

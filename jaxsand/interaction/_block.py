@@ -9,7 +9,7 @@ from jax import lax
 
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._frame import Frame, Places, cut, numbers, paste, places
-from jaxsand.interaction._ground import Relief
+from jaxsand.interaction.ground import Relief
 from jaxsand.interaction.resting import Sand, where_open
 from jaxsand.interaction.stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation.flux import Fluxes

@@ -230,7 +230,7 @@ def follow_frames(
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = as_path(path, height.dtype)
-    return as_needed(lambda scene, _: _follow(scene, height, path, rules, record=_itself), scene, rules, (height, path))
+    return as_needed(lambda scene, _: _follow(scene, height, path, rules, record=itself), scene, rules, (height, path))
 
 
 def rollout(
@@ -361,7 +361,8 @@ def as_path(path: ArrayLike, dtype: DTypeLike, least: int = 2) -> Float[Array, "
     return path
 
 
-def _itself(height: jax.Array) -> jax.Array:
+def itself(height: jax.Array) -> jax.Array:
+    """The map itself, to be recorded after each leg."""
     return height
 
 

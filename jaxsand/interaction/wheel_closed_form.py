@@ -65,7 +65,7 @@ class SplitPush:
         if isinstance(scene.tool, Wheel) and scene.tool.load is not None:
             raise ValueError(
                 "push: got SplitPush for a wheel under a load, but it keeps its wheel at one depth; give SteppedPush() or a "
-                "sinkage, such as that of jaxsand.forces.wheel_sinkage"
+                "sinkage, such as that of js.forces.wheel_sinkage"
             )
 
     def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Tree]:

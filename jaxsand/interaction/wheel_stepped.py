@@ -26,12 +26,11 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._block import Block
 from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._ground import Ground, ground_of
 from jaxsand.interaction._leg import Params, Steps, chunk, moved, way_of
 from jaxsand.interaction._path import Pushed, Record, State, along_legs
 from jaxsand.interaction._rolling import Roll, Touchdown, Turn
 from jaxsand.interaction._wheel import Track
-from jaxsand.relaxation.ghost_cells import mark
+from jaxsand.interaction.ground import Ground, ground_of
 from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Pose, Smooth, Wheel, carried_area, half_chord, sunk
@@ -55,7 +54,7 @@ def roll_along(
             "path: got heights, but a wheel under a load stands where the soil carries it; give x and y alone, or load=None"
         )
     wheel, heavy = sunk(wheel)
-    track = partial(_track_over, ground_of(mark(scene, height)[0]))
+    track = partial(_track_over, ground_of(scene, height))
     leg = partial(_leg, scene, push, path.shape[0] > 2, track)
     pushed, frames = along_legs(replace(scene, tool=wheel), height, path, push.rate, leg, record)
     return replace(pushed, outcome=jnp.where(heavy, jnp.int32(Outcome.NOT_CARRIED), pushed.outcome)), frames
@@ -98,6 +97,6 @@ def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
 
 def _track_over(ground: Ground, job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
     """A leg of a wheel that follows the ground at its sinkage."""
-    level, relief = ground.ahead(job, pose, length)
+    level, relief = ground.ahead(job.tool, pose, length)
     track = _track(replace(job, bottom=job.bottom + level), pose, length, angle)
     return replace(track, way=replace(track.way, relief=relief))

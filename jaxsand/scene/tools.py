@@ -186,7 +186,7 @@ class Wheel:
 
     The lowest point of its rim is at height -sinkage. The defaults are those of arXiv:1908.02745.
 
-    Under a load it sinks until the soil carries it (`jaxsand.forces.wheel_sinkage`), and follows the ground: over each point
+    Under a load it sinks until the soil carries it (`js.forces.wheel_sinkage`), and follows the ground: over each point
     of its way its lowest point is that sinkage below the mean level of the sand over its width, as the push found it. A load
     that the soil does not carry before the wheel stands in it up to its axle is refused, by `make_scene` or, where numbers
     are traced, by the outcome NOT_CARRIED.
@@ -200,7 +200,7 @@ class Wheel:
         grousers: `Smooth`, or `Grousers` that carry sand to behind the wheel.
         load: what the wheel carries, with its own weight (N), above 0; None for a wheel at a fixed sinkage, which costs
             nothing.
-        soil: what carries a load, a `jaxsand.forces.Soil`; None for `jaxsand.forces.WONG_DRY_SAND`.
+        soil: what carries a load, a `js.forces.Soil`; None for `js.forces.WONG_DRY_SAND`.
         slip: slip ratio under a load, 1 - speed / (radius * rate), 0 to 1; None for that of the grousers' spin,
             1 - 1 / spin, and 0 of a smooth wheel.
 
@@ -258,7 +258,7 @@ def _check_load(wheel: Wheel) -> None:
         return
     positive("tool.load", wheel.load, "give newtons, or None for a wheel at a fixed sinkage")
     if wheel.soil is not None and not isinstance(wheel.soil, Soil):
-        raise ValueError(f"tool.soil: got {short(wheel.soil)}; give a jaxsand.forces.Soil, or None for a dry sand")
+        raise ValueError(f"tool.soil: got {short(wheel.soil)}; give a js.forces.Soil, or None for a dry sand")
     soil, slip = soil_of(wheel), concrete(slip_of(wheel))
     check_soil(soil)
     if slip is not None and not (slip.ndim == 0 and 0 <= slip <= 1):

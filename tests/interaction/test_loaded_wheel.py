@@ -1,7 +1,5 @@
 """A wheel under a load: it stands where the soil carries it, and follows the ground."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 import jaxsand as js
 from jaxsand.goals.metrics import volume_error
-from jaxsand.interaction._ground import ground_of
+from jaxsand.interaction.ground import ground_of
 
 from ..conftest import ANGLE
 
@@ -102,9 +100,8 @@ def test_grousers_give_the_slip():
 
 
 def level(height, pose, by, dx=DX, width=0.03, slip=0.0):
-    tool = js.Wheel(width=width, slip_angle=slip)
-    job = SimpleNamespace(tool=tool, bed=SimpleNamespace(spacing=jnp.asarray(dx)))
-    return ground_of(jnp.asarray(height)).level(job, js.Pose(*map(jnp.asarray, pose)), jnp.asarray(by))
+    ground = ground_of(js.make_scene(np.shape(height), dx), jnp.asarray(height))
+    return ground.level(js.Wheel(width=width, slip_angle=slip), js.Pose(*map(jnp.asarray, pose)), jnp.asarray(by))
 
 
 def test_the_ground_of_a_plane_is_exact_and_ends_where_the_map_ends():

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
-from jaxsand.interaction._displacement import Job
-from jaxsand.scene.tools import Pose
+from jaxsand.relaxation.ghost_cells import mark
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Pose, Wheel
 
 _ACROSS = 16
 
@@ -47,26 +49,27 @@ class Ground:
     Attributes:
         height: of the sand (m), 0 where there is none.
         sand: 1 for cells with sand, else 0.
+        spacing: of the grid (m).
     """
 
     height: jax.Array
     sand: jax.Array
+    spacing: jax.Array
 
-    def ahead(self, job: Job, pose: Pose, length: jax.Array) -> tuple[jax.Array, Relief]:
-        """The level (m) at the start of a leg of the job's wheel, and how it goes on along `length` (m)."""
+    def ahead(self, wheel: Wheel, pose: Pose, length: jax.Array) -> tuple[jax.Array, Relief]:
+        """The level (m) at the start of a wheel's leg, and how it goes on along `length` (m)."""
         count = math.ceil(math.hypot(*self.height.shape)) + 2
-        dx = job.bed.spacing
-        stride = jnp.maximum(length / (count - 1), dx)
-        level = self.level(job, pose, stride * jnp.arange(count, dtype=dx.dtype))
-        return level[0], Relief(level - level[0], stride / dx)
+        stride = jnp.maximum(length / (count - 1), self.spacing)
+        level = self.level(wheel, pose, stride * jnp.arange(count, dtype=self.height.dtype))
+        return level[0], Relief(level - level[0], stride / self.spacing)
 
-    def level(self, job: Job, pose: Pose, by: jax.Array) -> jax.Array:
-        """The mean level (m) over the width of the job's wheel, at distances `by` [K] (m) ahead of a pose."""
-        dx, slip = job.bed.spacing, jnp.asarray(job.tool.slip_angle)
-        aside = (((jnp.arange(_ACROSS, dtype=dx.dtype) + 0.5) / _ACROSS - 0.5) * job.tool.width)[None]
+    def level(self, wheel: Wheel, pose: Pose, by: jax.Array) -> jax.Array:
+        """The mean level (m) over the wheel's width, at distances `by` [K] (m) ahead of a pose."""
+        slip = jnp.asarray(wheel.slip_angle)
+        aside = (((jnp.arange(_ACROSS, dtype=self.height.dtype) + 0.5) / _ACROSS - 0.5) * wheel.width)[None]
         s, n = by[:, None] + aside * jnp.sin(slip), aside * jnp.cos(slip)
         x, y = pose.x + s * pose.cos - n * pose.sin, pose.y + s * pose.sin + n * pose.cos
-        ends = [_ends(at / dx - 0.5, cells) for at, cells in zip((y, x), self.height.shape, strict=True)]
+        ends = [_ends(at / self.spacing - 0.5, cells) for at, cells in zip((y, x), self.height.shape, strict=True)]
         total = parts = jnp.zeros_like(x)
         for row, of_row in ends[0]:
             for column, of_column in ends[1]:
@@ -77,10 +80,11 @@ class Ground:
         return jnp.sum(total, axis=1) / jnp.where(whole > 0, whole, 1)
 
 
-def ground_of(marked: jax.Array) -> Ground:
-    """The ground of a map [H, W] (m) that is NaN where there is no sand."""
+def ground_of(scene: Scene, height: Float[Array, "H W"]) -> Ground:
+    """The ground of a scene's map (m)."""
+    marked, _ = mark(scene, height)
     bare = jnp.isnan(marked)
-    return Ground(jnp.where(bare, 0, marked), jnp.where(bare, 0, 1).astype(marked.dtype))
+    return Ground(jnp.where(bare, 0, marked), jnp.where(bare, 0, 1).astype(height.dtype), jnp.asarray(scene.grid.spacing))
 
 
 def _ends(at: jax.Array, cells: int) -> list[tuple[jax.Array, jax.Array]]:
