@@ -162,10 +162,10 @@ def test_what_makes_no_sense_is_named(tool, more, named):
 
 @pytest.mark.slow
 def test_work_converges_as_sub_steps_are_refined():
-    work = [float(feel(CHANNEL, np.zeros(BED), PATH, CLEAN, substeps=n)[1].work.sum()) for n in (2, 4, 8, 16, 32)]
+    work = [float(feel(CHANNEL, np.zeros(BED), PATH, CLEAN, substeps=n)[1].work.sum()) for n in (2, 4, 8, 16)]
     changes = np.abs(np.diff(work))
     assert np.all(changes[1:] < 0.7 * changes[:-1])
-    assert changes[-1] < 0.01 * work[-1]
+    assert changes[-1] < 0.02 * work[-1]
 
 
 @pytest.mark.slow
