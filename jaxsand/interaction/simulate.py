@@ -168,7 +168,8 @@ def follow(
         scene: the scene, with the tool.
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
         path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2; or [n, 3] = x, y, z (m), with z the
-            height of the tool's lowest point, linear along each leg. The tool may begin or end in the air.
+            height of the tool's lowest point, linear along each leg. The tool may begin or end in the air. Of a wheel under
+            a load [n, 2].
         push: as of `step`.
         scheme: as of `settle`.
         stop: as of `settle`.

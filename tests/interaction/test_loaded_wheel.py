@@ -130,6 +130,14 @@ def test_the_ground_is_read_to_second_order():
     assert np.log2(errors[1] / errors[2]) > 1.8
 
 
+def test_the_ground_is_linear_in_the_map():
+    rng = np.random.default_rng(1)
+    height, way = jnp.asarray(rng.standard_normal((2, *SHAPE)))
+    where = (0.05, 0.05, 0.8, 0.6), np.array([0.0, 0.013, 0.06])
+    _, slope = jax.jvp(lambda h: level(h, *where), (height,), (way,))
+    np.testing.assert_allclose(slope, level(height + way, *where) - level(height, *where), rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_derivatives_by_load_and_ground():
     rng = np.random.default_rng(5)

@@ -145,6 +145,21 @@ def test_a_bucket_feels_its_cut():
     assert float(js.load_volume(scene, loaded.load)) == pytest.approx(WAY * DEEP * 0.02, rel=1e-6)
 
 
+@pytest.mark.slow
+def test_derivatives_of_a_wheels_forces():
+    """By the load and the slip; and in a batch."""
+
+    def work(v):
+        wheel = js.Wheel(radius=0.03, width=0.03, load=v[0], slip=v[1])
+        trace = rolling(js.make_scene(SHAPE, 0.01, ANGLE, tool=wheel), LEVEL, ROLL, None)
+        return trace.work.sum() - 0.01 * trace.force[-1, 1]
+
+    v = np.array([5.0, 0.2])
+    got, many = jax.jit(jax.grad(work))(v), jax.jit(jax.vmap(work))
+    steps = np.diag(1e-5 * v)
+    np.testing.assert_allclose(got, (many(v + steps) - many(v - steps)) / (2e-5 * v), rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("tool", "more", "named"),
     [
