@@ -17,6 +17,7 @@ from jax import lax
 from jaxsand.scene.soil import TINY, Scalar, Soil, check_number, check_soil
 from jaxsand.scene.validation import concrete
 
+_NODES = 40  # of the Gauss quadrature over the contact
 _LEAST = 1e-8  # of the radius: a sinkage below which load and sinkage are taken as proportional
 _STEPS = 16  # of Newton's method, which takes 4 or 5 from where it starts
 
@@ -83,7 +84,7 @@ def wheel_force(soil: Soil, radius: Scalar, width: Scalar, sinkage: Scalar, slip
     check_number("slip", slip, 0, 1, "give 1 - speed / (radius * rate) of a driven wheel")
     touches = jnp.asarray(sinkage) > 0
     entry = 2 * jnp.arcsin(jnp.sqrt(jnp.where(touches, sinkage, radius) / (2 * jnp.asarray(radius))))
-    nodes, weights = (jnp.asarray(a, entry.dtype) for a in np.polynomial.legendre.leggauss(40))
+    nodes, weights = (jnp.asarray(a, entry.dtype) for a in np.polynomial.legendre.leggauss(_NODES))
     root = (1 + nodes) / 2  # t = t_1 (1 - root^2) smooths p^n at the entry
     t, dt = entry * (1 - root**2), entry * root * weights
     below = 2 * radius * jnp.sin((entry + t) / 2) * jnp.sin((entry - t) / 2)

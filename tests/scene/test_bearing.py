@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import beta
 
+from jaxsand.scene import bearing
 from jaxsand.scene.bearing import bekker_resistance, bekker_sinkage, wheel_force, wheel_sinkage
 from jaxsand.scene.soil import LETE_SAND, WONG_DRY_SAND
 
@@ -67,6 +68,20 @@ def test_quadrature(s, slip):
     np.testing.assert_allclose(got.load, over(lambda t: p(t) * math.cos(t) + tau(t) * math.sin(t)), rtol=1e-7)
     np.testing.assert_allclose(got.pull, over(lambda t: tau(t) * math.cos(t) - p(t) * math.sin(t)), rtol=1e-7)
     np.testing.assert_allclose(got.torque, r * over(tau), rtol=1e-7)
+
+
+def test_order_of_the_quadrature(monkeypatch):
+    """In sqrt(1 - t / t_1) the pressure's power at the entry is mild: of order seven in the number of nodes, for n = 0.8."""
+
+    def load(nodes):
+        monkeypatch.setattr(bearing, "_NODES", nodes)
+        return float(wheel_force(LETE_SAND, 0.25, 0.15, 0.04, 0.2).load)
+
+    exact = load(200)
+    errors = [abs(load(nodes) / exact - 1) for nodes in (4, 8, 16)]
+    assert errors[2] < 1e-8
+    assert np.log2(errors[0] / errors[1]) > 6
+    assert np.log2(errors[1] / errors[2]) > 6
 
 
 def test_slip_gives_pull_and_torque():
