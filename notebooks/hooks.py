@@ -16,10 +16,13 @@ from typing import Any
 HERE = Path(__file__).parent
 CACHE = HERE.parent / "build" / "notebooks"
 ROOMS = {  # rooms of the package with public names, and what else is public in them
-    "scene": ("Scene", ()),
+    "scene": ("Scene", ("jaxsand.scene.bearing", "jaxsand.scene.soil")),
     "relaxation": ("Relaxation", ()),
     "interaction": ("Interaction", ()),
-    "terramechanics": ("Terramechanics", ("jaxsand.terramechanics.forces", "jaxsand.terramechanics.wheel_trench")),
+    "terramechanics": (
+        "Terramechanics",
+        ("jaxsand.terramechanics.cutting", "jaxsand.terramechanics.force_trace", "jaxsand.terramechanics.wheel_trench"),
+    ),
     "goals": ("Goals", ("jaxsand.goals.metrics",)),
     "planning": ("Planning", ()),
     "envs": ("Environments", ("jaxsand.envs",)),

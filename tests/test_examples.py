@@ -9,8 +9,10 @@ import pytest
 
 import jaxsand as js
 from jaxsand.autodiff.while_loop import repeat_until
+from jaxsand.terramechanics import forces
 
-PUBLIC = {name: getattr(js, name) for name in sorted(js.__all__)}
+FORCES = {f"forces.{name}": getattr(js.forces, name) for name in forces.__all__}
+PUBLIC = {name: getattr(js, name) for name in sorted(js.__all__)} | FORCES
 EXAMPLES = {name: obj for name, obj in PUBLIC.items() if inspect.isroutine(obj) or inspect.isclass(obj)}
 
 

@@ -9,6 +9,7 @@ from jax import lax
 
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._frame import Frame, Places, cut, numbers, paste, places
+from jaxsand.interaction.ground import Relief
 from jaxsand.interaction.resting import Sand, where_open
 from jaxsand.interaction.stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation.flux import Fluxes
@@ -42,6 +43,7 @@ class Way:
         room: sum of heights that the tool's bucket can take up from the path's start on (quanta), or None if it has none.
         base: height of the floor under the sand, a flat map [cells] (m), or None if there is none.
         plates: how far plates reach ahead of the blade's face, or None if it has none.
+        relief: how the ground rises and falls that the bottom follows, or None.
     """
 
     start: Pose
@@ -60,9 +62,12 @@ class Way:
     yaw: jax.Array | None = None
     base: jax.Array | None = None
     plates: jax.Array | None = None
+    relief: Relief | None = None
 
     def at(self, by: jax.Array) -> "Way":
         """The leg as it is when the blade has moved by a length (spacings): with its bottom at the height there."""
+        if self.relief is not None:
+            return replace(self, bottom=self.bottom + self.relief.at(by))
         return self if self.rise is None else replace(self, bottom=self.bottom + by * self.rise)
 
 

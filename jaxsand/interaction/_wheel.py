@@ -54,7 +54,8 @@ class Track:
 
     def at(self, by: jax.Array) -> "Track":
         """The leg as it is when the wheel has moved by a length (spacings)."""
-        return self if self.way.rise is None else replace(self, way=self.way.at(by))
+        level = self.way.rise is None and self.way.relief is None
+        return self if level else replace(self, way=self.way.at(by))
 
     def seen(self, frame: Frame) -> jax.Array:
         """The slip angle in a frame, where a mirror changes its sign."""

@@ -63,15 +63,21 @@ def push_along(
 
 
 def scoop_along(
-    scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n 3"], push: "SteppedPush", room: Float[Array, ""]
-) -> tuple[Pushed, tuple[jax.Array, jax.Array]]:
+    scene: Scene,
+    height: Float[Array, "H W"],
+    path: Float[Array, "n 3"],
+    push: "SteppedPush",
+    room: Float[Array, ""],
+    record: Record | None = None,
+) -> tuple[Pushed, Tree, tuple[jax.Array, jax.Array]]:
     """Moves a bucket's edge along `path` (m); what it cuts goes into the bucket, up to a sum of heights of `room` (m).
 
     The scene's tool is a blade as wide as the edge, a cell thick at most. It is moved such that its rear starts at path[0]
     and its front ends at path[-1], so that what it cuts lies between the path's ends. First and last legs shorter than half
     a cell are cut a little beyond their ends. Every leg keeps some of its length, and thereby its heading.
 
-    Returns the map, and the account (low, high) of the sum of heights (m) in the bucket.
+    Returns the map, what `record` returned after each leg, and the account (low, high) of the sum of heights (m) in the
+    bucket.
     """
     runs = path[1:] - path[:-1]
     lengths = jax.vmap(lambda start, stop: heading(start, stop, None)[1])(path[:-1, :2], path[1:, :2])
@@ -84,9 +90,9 @@ def scoop_along(
     path = jnp.where(jnp.any(upright(path)), jnp.nan, moved)
     scene = replace(scene, tool=replace(scene.tool, thickness=thick, depth=jnp.max(-path[:, 2])))
     leg = partial(_leg, scene, push, bring_to_rest, path.shape[0] > 2)
-    pushed, _, scooped = travelled(scene, height, path, push.rate, leg, rises=True, room=room)
+    pushed, frames, scooped = travelled(scene, height, path, push.rate, leg, record, rises=True, room=room)
     assert scooped is not None
-    return pushed, scooped
+    return pushed, frames, scooped
 
 
 def _leg(

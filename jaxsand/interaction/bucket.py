@@ -15,10 +15,11 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxsand.interaction._path import farthest, heading
+from jaxsand.autodiff.while_loop import Tree
+from jaxsand.interaction._path import Record, farthest, heading
 from jaxsand.interaction.blade_stepped import scoop_along
 from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured
-from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, as_path, lifted, ready
+from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, as_path, itself, lifted, ready
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax
@@ -121,6 +122,34 @@ def scoop(
         >>> print(f"{js.load_volume(scene, scooped.load):.2e} {js.volume(scene, scooped.height):.2e}")
         8.00e-06 -8.00e-06
     """
+    return _scoop(scene, height, path, load, push, scheme, stop)[0]
+
+
+def scoop_frames(
+    scene: Scene,
+    height: Float[ArrayLike, "H W"],
+    path: Path,
+    load: Load | None = None,
+    *,
+    push: SteppedPush | None = None,
+    scheme: Scheme | None = None,
+    stop: Stop | None = None,
+) -> tuple[Loaded, Float[Array, "n-1 H W"]]:
+    """`scoop`, and the maps [n - 1, H, W] (m) after each leg, as `follow_frames`."""
+    return _scoop(scene, height, path, load, push, scheme, stop, itself)
+
+
+def _scoop(
+    scene: Scene,
+    height: Float[ArrayLike, "H W"],
+    path: Path,
+    load: Load | None,
+    push: SteppedPush | None,
+    scheme: Scheme | None,
+    stop: Stop | None,
+    record: Record | None = None,
+) -> tuple[Loaded, Tree]:
+    """`scoop`, and what `record` returned after each leg."""
     bucket = _bucket(scene)
     if push is not None and not isinstance(push, SteppedPush):
         raise ValueError(f"push: got {push!r}; a bucket scoops by SteppedPush(substep, sweeps)")
@@ -131,7 +160,8 @@ def scoop(
         path = jnp.concatenate([path, jnp.full_like(path[:, :1], -jnp.asarray(bucket.depth, path.dtype))], 1)
     held = _one_load(load, height.dtype)
     capacity = jnp.asarray(bucket.capacity, height.dtype)
-    return as_needed(partial(_scooped, height, path, held, capacity, rules), edge, rules, (height, path, held, capacity))
+    run = partial(_scooped, height, path, held, capacity, rules, record=record)
+    return as_needed(run, edge, rules, (height, path, held, capacity))
 
 
 def dump(
@@ -249,20 +279,27 @@ def _two_sum(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     return whole, lax.stop_gradient((a - lax.optimization_barrier(whole - other)) + (b - other))
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="record")
 def _scooped(
-    height: jax.Array, path: jax.Array, load: Load, capacity: jax.Array, rules: Rules, scene: Scene, window: Whole | Window
-) -> Loaded:
+    height: jax.Array,
+    path: jax.Array,
+    load: Load,
+    capacity: jax.Array,
+    rules: Rules,
+    scene: Scene,
+    window: Whole | Window,
+    record: Record | None = None,
+) -> tuple[Loaded, Tree]:
     push, scheme, stop = rules
     assert isinstance(push, SteppedPush)
     there = load.high + load.low
     sound = jnp.isfinite(there) & (there >= 0) & (capacity > 0)
     room = jnp.where(sound, jnp.maximum(capacity / scene.grid.spacing**2 - there, 0), 0)
     path = jnp.where(sound, path, jnp.nan)  # which leaves the map as it is, and is told of
-    pushed, account = scoop_along(scene, height, path, push, room)
+    pushed, frames, account = scoop_along(scene, height, path, push, room, record)
     edge = replace(pushed, pose=replace(pushed.pose, x=path[-1, 0], y=path[-1, 1]))
     shaped = lifted(edge, relax(scene, pushed.height, scheme, stop, window))
-    return Loaded(**vars(shaped), load=jax.tree.map(partial(jnp.where, sound), _added(load, account, 1), load))
+    return Loaded(**vars(shaped), load=jax.tree.map(partial(jnp.where, sound), _added(load, account, 1), load)), frames
 
 
 @jax.jit

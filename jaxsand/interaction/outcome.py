@@ -38,6 +38,10 @@ _ADVICE = {
     Outcome.BELOW_BASE: (
         "the map lies below the scene's base somewhere, where no sand can be: start from jnp.maximum(height, base)"
     ),
+    Outcome.NOT_CARRIED: (
+        "the soil does not carry the wheel before it stands in it up to its axle: lighten it, or give a larger wheel or a "
+        "firmer soil"
+    ),
 }
 
 

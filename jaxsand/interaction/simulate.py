@@ -168,7 +168,8 @@ def follow(
         scene: the scene, with the tool.
         height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
         path: the points [n, 2] = x, y (m) that the tool's centre visits, n >= 2; or [n, 3] = x, y, z (m), with z the
-            height of the tool's lowest point, linear along each leg. The tool may begin or end in the air.
+            height of the tool's lowest point, linear along each leg. The tool may begin or end in the air. Of a wheel under
+            a load [n, 2].
         push: as of `step`.
         scheme: as of `settle`.
         stop: as of `settle`.
@@ -230,7 +231,7 @@ def follow_frames(
     """
     scene, height, rules = ready(scene, height, push, scheme, stop)
     path = as_path(path, height.dtype)
-    return as_needed(lambda scene, _: _follow(scene, height, path, rules, record=_itself), scene, rules, (height, path))
+    return as_needed(lambda scene, _: _follow(scene, height, path, rules, record=itself), scene, rules, (height, path))
 
 
 def rollout(
@@ -361,7 +362,8 @@ def as_path(path: ArrayLike, dtype: DTypeLike, least: int = 2) -> Float[Array, "
     return path
 
 
-def _itself(height: jax.Array) -> jax.Array:
+def itself(height: jax.Array) -> jax.Array:
+    """The map itself, to be recorded after each leg."""
     return height
 
 

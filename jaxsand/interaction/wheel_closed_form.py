@@ -63,6 +63,11 @@ class SplitPush:
                 f"push: got SplitPush for a {type(scene.tool).__name__}; SplitPush() is for a Wheel, SteppedPush() for both"
             )
         deep(scene, "SplitPush")
+        if isinstance(scene.tool, Wheel) and scene.tool.load is not None:
+            raise ValueError(
+                "push: got SplitPush for a wheel under a load, but it keeps its wheel at one depth; give SteppedPush() or a "
+                "sinkage, such as that of js.forces.wheel_sinkage"
+            )
 
     def along(self, scene: Scene, height: jax.Array, path: jax.Array, record: Record | None = None) -> tuple[Pushed, Tree]:
         """Moves the scene's wheel along the path; see `PushRule`."""

@@ -15,6 +15,7 @@ repose and above its complement the two agree.
 """
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -25,12 +26,14 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._block import Block
 from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._leg import Steps, chunk, moved, way_of
+from jaxsand.interaction._leg import Params, Steps, chunk, moved, way_of
 from jaxsand.interaction._path import Pushed, Record, State, along_legs
 from jaxsand.interaction._rolling import Roll, Touchdown, Turn
 from jaxsand.interaction._wheel import Track
+from jaxsand.interaction.ground import Ground, ground_of
+from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Pose, Smooth, carried_area, half_chord
+from jaxsand.scene.tools import Pose, Smooth, Wheel, carried_area, half_chord, sunk
 from jaxsand.scene.window import Window
 
 if TYPE_CHECKING:
@@ -41,15 +44,27 @@ def roll_along(
     scene: Scene, height: Float[Array, "H W"], path: Float[Array, "n _"], push: "SteppedPush", record: Record | None = None
 ) -> tuple[Pushed, Tree]:
     """Lowers the wheel at path[0], moves it along the legs of `path` (m) and lifts it; see `along_legs`."""
-
-    leg = partial(_leg, scene, push, path.shape[0] > 2)
-    return along_legs(scene, height, path, push.rate, leg, record, rises=True)
+    wheel = scene.tool
+    assert isinstance(wheel, Wheel)
+    if wheel.load is None:
+        leg = partial(_leg, scene, push, path.shape[0] > 2, _track)
+        return along_legs(scene, height, path, push.rate, leg, record, rises=True)
+    if path.shape[1] == 3:
+        raise ValueError(
+            "path: got heights, but a wheel under a load stands where the soil carries it; give x and y alone, or load=None"
+        )
+    wheel, heavy = sunk(wheel)
+    track = partial(_track_over, ground_of(scene, height))
+    leg = partial(_leg, scene, push, path.shape[0] > 2, track)
+    pushed, frames = along_legs(replace(scene, tool=wheel), height, path, push.rate, leg, record)
+    return replace(pushed, outcome=jnp.where(heavy, jnp.int32(Outcome.NOT_CARRIED), pushed.outcome)), frames
 
 
 def _leg(
     scene: Scene,
     push: "SteppedPush",
     keeps: bool,
+    track: Params,
     job: Job,
     pose: Pose,
     length: jax.Array,
@@ -68,7 +83,7 @@ def _leg(
         Roll(block, substep=substep, sweeps=sweeps, chunk=chunk(substep), lowered=before is None, keeps=keeps),
         4 * math.hypot(*shape) + 3,  # make_scene holds radius and width below the map's diagonal
     )
-    return moved(scene, job, steps, _track, pose, length, before, state)
+    return moved(scene, job, steps, track, pose, length, before, state)
 
 
 def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
@@ -78,3 +93,10 @@ def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
     way = way_of(job, pose, length, angle, half_chord(wheel.radius, deep) / dx, jnp.asarray(wheel.width) / dx / 2)
     carried = None if isinstance(wheel.grousers, Smooth) else carried_area(wheel, wheel.grousers) / dx
     return Track(way, jnp.asarray(wheel.radius) / dx, jnp.asarray(wheel.slip_angle), carried)
+
+
+def _track_over(ground: Ground, job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
+    """A leg of a wheel that follows the ground at its sinkage."""
+    level, relief = ground.ahead(job.tool, pose, length)
+    track = _track(replace(job, bottom=job.bottom + level), pose, length, angle)
+    return replace(track, way=replace(track.way, relief=relief))

@@ -30,6 +30,8 @@ class Outcome(IntFlag):
         NOT_POURED: less sand was poured, or removed, than asked for: the bucket or the bed held less, or no cell with sand
             lies where it was poured.
         BELOW_BASE: the map lies below the scene's floor somewhere. No sand lies there, and it was left as it is.
+        NOT_CARRIED: a wheel's load is more than the soil carries before the wheel stands in it up to its axle. The map is as
+            it was.
 
     Example:
         >>> import jaxsand as js
@@ -44,6 +46,7 @@ class Outcome(IntFlag):
     NOT_FINITE = 4
     NOT_POURED = 8
     BELOW_BASE = 16
+    NOT_CARRIED = 32
 
 
 def said(outcome: Outcome, yes: Bool[Array, "..."]) -> Int[Array, "..."]:

@@ -1,7 +1,7 @@
 """Tools: their geometry, their poses, and the share of each cell that they cover."""
 
 import math
-from dataclasses import Field, dataclass, field
+from dataclasses import Field, dataclass, field, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsand.scene.bearing import wheel_force, wheel_sinkage
 from jaxsand.scene.grid import Grid
+from jaxsand.scene.soil import WONG_DRY_SAND, Soil, check_soil
 from jaxsand.scene.validation import concrete, finite, positive, short
 
 MOST_YAW = math.pi / 3  # the largest angle of a blade to its way (rad)
@@ -191,17 +193,27 @@ class Grousers:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel that is towed or driven at a fixed sinkage, with its plane at an angle to the direction of travel.
+    """A wheel at a fixed sinkage or under a load, with its plane at an angle to the direction of travel.
 
     The lowest point of its rim is at height -sinkage. The defaults are those of arXiv:1908.02745.
+
+    Under a load it sinks until the soil carries it (`js.forces.wheel_sinkage`), and follows the ground: over each point
+    of its way its lowest point is that sinkage below the mean level of the sand over its width, as the push found it. A load
+    that the soil does not carry before the wheel stands in it up to its axle is refused, by `make_scene` or, where numbers
+    are traced, by the outcome NOT_CARRIED.
 
     Attributes:
         radius: radius of the rim (m).
         width: width of the rim (m).
-        sinkage: depth of the lowest point below height 0 (m), above 0 and at most the radius.
+        sinkage: depth of the lowest point below height 0 (m), above 0 and at most the radius; not used under a load.
         slip_angle: angle from the wheel's plane to the direction of travel (rad), counter-clockwise, -pi/2 to pi/2. At
             pi/2 the wheel is dragged sideways, to its left.
         grousers: `Smooth`, or `Grousers` that carry sand to behind the wheel.
+        load: what the wheel carries, with its own weight (N), above 0; None for a wheel at a fixed sinkage, which costs
+            nothing.
+        soil: what carries a load, a `js.forces.Soil`; None for `js.forces.WONG_DRY_SAND`.
+        slip: slip ratio under a load, 1 - speed / (radius * rate), 0 to 1; None for that of the grousers' spin,
+            1 - 1 / spin, and 0 of a smooth wheel.
 
     Example:
         >>> import math
@@ -209,6 +221,8 @@ class Wheel:
         >>> wheel = js.Wheel(radius=0.03, width=0.02, sinkage=0.005, slip_angle=math.radians(30))
         >>> js.make_scene((8, 8), 0.01, tool=wheel).tool.sinkage
         0.005
+        >>> js.make_scene((8, 8), 0.01, tool=js.Wheel(radius=0.03, width=0.02, load=2.0, slip=0.2)).tool.load
+        2.0
     """
 
     radius: Number = 0.048
@@ -216,14 +230,17 @@ class Wheel:
     sinkage: Number = 0.015
     slip_angle: Number = 0.0
     grousers: Smooth | Grousers = field(default_factory=Smooth)
+    load: Number | None = None
+    soil: Soil | None = None
+    slip: Number | None = None
 
     def check(self, grid: Grid) -> None:
-        """Raises ValueError if a length or an angle is out of range; see `Tool`."""
-        for name in ("radius", "width", "sinkage"):
+        """Raises ValueError if a length or an angle is out of range, or the soil does not carry the load; see `Tool`."""
+        for name in ("radius", "width", "sinkage") if self.load is None else ("radius", "width"):
             positive(f"tool.{name}", getattr(self, name), f"give the wheel's {name} in metres")
         finite("tool.slip_angle", self.slip_angle, "give the angle from the wheel's plane to its way in rad")
         radius, sinkage, slip = map(concrete, (self.radius, self.sinkage, self.slip_angle))
-        if sinkage is not None and radius is not None and sinkage > radius:
+        if self.load is None and sinkage is not None and radius is not None and sinkage > radius:
             raise ValueError(f"tool.sinkage: got {self.sinkage!r} m, deeper than the axle; give at most the radius")
         if slip is not None and abs(slip) > math.pi / 2 * (1 + 1e-6):
             raise ValueError(
@@ -240,6 +257,33 @@ class Wheel:
                     raise ValueError(f"tool.grousers.{name}: got {got}; it must be one finite number of 0 or more")
         elif not isinstance(self.grousers, Smooth):
             raise ValueError(f"tool.grousers: got {self.grousers!r}; give Smooth() or Grousers(height, fill, spin)")
+        _check_load(self)
+
+
+def _check_load(wheel: Wheel) -> None:
+    """Raises ValueError unless the soil carries the wheel's load, or if what belongs to a load is given without one."""
+    if wheel.load is None:
+        for name, value in (("soil", wheel.soil), ("slip", wheel.slip)):
+            if value is not None:
+                raise ValueError(f"tool.{name}: got one for a wheel without a load; give load= in newtons, or {name}=None")
+        return
+    positive("tool.load", wheel.load, "give newtons, or None for a wheel at a fixed sinkage")
+    if wheel.soil is not None and not isinstance(wheel.soil, Soil):
+        raise ValueError(f"tool.soil: got {short(wheel.soil)}; give a js.forces.Soil, or None for a dry sand")
+    soil, slip = soil_of(wheel), concrete(slip_of(wheel))
+    check_soil(soil)
+    if slip is not None and not (slip.ndim == 0 and 0 <= slip <= 1):
+        named = f"slip: got {short(wheel.slip)}" if wheel.slip is not None else "grousers.spin: got less than 1 under a load"
+        raise ValueError(f"tool.{named}; give a slip ratio of 0 to 1, which is 1 - 1 / spin of a driven wheel")
+    if any(concrete(leaf) is None for leaf in jax.tree.leaves((wheel, soil))):
+        return
+    with jax.ensure_compile_time_eval():
+        most = float(_most(wheel))
+    if not float(wheel.load) <= most:
+        raise ValueError(
+            f"tool.load: got {short(wheel.load)} N, but the soil carries {most:.4g} N when the wheel stands in it up to its "
+            "axle; lighten it, give a larger wheel, or a firmer soil"
+        )
 
 
 def _at_least_a_cell(kind: str, sizes: dict[str, Number], grid: Grid) -> None:
@@ -289,6 +333,39 @@ def usable(tool: Tool) -> Bool[Array, ""]:
     if isinstance(tool, Blade) and tool.plates is not None:
         good = good & (tool.plates >= 0)
     return good
+
+
+def soil_of(wheel: Wheel) -> Soil:
+    """What carries a wheel's load."""
+    return WONG_DRY_SAND if wheel.soil is None else wheel.soil
+
+
+def slip_of(wheel: Wheel) -> Number:
+    """The slip ratio of a wheel under a load."""
+    if wheel.slip is not None:
+        return wheel.slip
+    return 1 - 1 / wheel.grousers.spin if isinstance(wheel.grousers, Grousers) else 0.0
+
+
+def sunk(wheel: Wheel) -> tuple[Wheel, Bool[Array, ""]]:
+    """A wheel under a load as one at the sinkage at which its soil carries that, and whether it is too heavy for the soil.
+
+    The sinkage is NaN if the wheel is too heavy or its numbers are out of range.
+    """
+    assert wheel.load is not None
+    slip = jnp.asarray(slip_of(wheel))
+    fits = (slip >= 0) & (slip <= 1)
+    sinkage = wheel_sinkage(soil_of(wheel), wheel.radius, wheel.width, wheel.load, jnp.where(fits, slip, 0))
+    heavy = jnp.isnan(sinkage) & fits
+    for leaf in jax.tree.leaves(wheel):
+        heavy = heavy & jnp.isfinite(leaf)
+    return replace(wheel, sinkage=jnp.where(fits, sinkage, jnp.nan), load=None, soil=None, slip=None), heavy
+
+
+@jax.jit
+def _most(wheel: Wheel) -> Scalar:
+    """The load (N) that the soil carries when the wheel stands in it up to its axle."""
+    return wheel_force(soil_of(wheel), wheel.radius, wheel.width, wheel.radius, slip_of(wheel)).load
 
 
 def half_chord(radius: Number, sinkage: Number) -> Scalar:
