@@ -143,9 +143,10 @@ def test_derivatives(neighbours):
     rock = rough(4, 0.06) - 0.06
     weights = np.random.default_rng(1).normal(size=(N, N))
     sand = js.settle(on(rock, None, neighbours), np.maximum(rough(5, 0.04) - 0.04, rock)).height
+    hill = np.where(sand > rock + 1e-3, np.outer(np.hanning(N), np.hanning(N)), 0)  # bare floor has a kink
 
     def of(stroke, lift):
-        scene = on(rock + lift * HILL, js.Blade(0.06, 0.015, 0.03), neighbours)
+        scene = on(rock + lift * hill, js.Blade(0.06, 0.015, 0.03), neighbours)
         return jnp.sum(weights * js.act(scene, sand, stroke).height)
 
     at = (jnp.array([0.06, 0.071, 0.14, 0.123]), 0.0)
@@ -156,9 +157,6 @@ def test_derivatives(neighbours):
         assert float(by_stroke[k]) == pytest.approx(float(ends[1] - ends[0]) / (2 * step), rel=1e-4, abs=1e-4)
     ends = [value(at[0], sign * step) for sign in (-1, 1)]
     assert float(by_lift) == pytest.approx(float(ends[1] - ends[0]) / (2 * step), rel=1e-4, abs=1e-4)
-
-
-HILL = np.outer(np.hanning(N), np.hanning(N))
 
 
 @pytest.mark.parametrize(("push", "tool"), [(js.SwathPush(), js.Blade()), (js.SplitPush(), js.Wheel())])
