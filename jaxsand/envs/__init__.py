@@ -198,13 +198,15 @@ def _multi(
         scene = usual_scene(window=window)
     check_scene(scene)
     check_heights(env, blade_of(scene))
-    check_zones(scene, params.get("zones", NoZones()))
+    zones = params.get("zones", NoZones())
+    check_zones(scene, zones)
     scene = with_near(scene)
     if isinstance(goals, LevelGoals | RoughGoals):
         check_ready_goals(scene, goals, starts)
         pool: LevelGoals | RoughGoals = jax.tree.map(jnp.asarray, goals)
     else:
-        pool = library(env, scene, RandomStrokes() if goals is None else goals, Level() if starts is None else starts, seed)
+        begin = Level() if starts is None else starts
+        pool = library(env, scene, RandomStrokes() if goals is None else goals, begin, seed, zones)
     return env, StrokeParams(scene, pool, **params)
 
 
@@ -234,7 +236,7 @@ def _excavate(
     else:
         blade = Blade(bucket.width, jnp.maximum(Blade().thickness, dx), bucket.depth)
         pusher = MultiStroke(env.push, batching=env.batching, settle=env.settle)
-        pool = library(pusher, with_near(replace(scene, tool=blade)), goals, begin, seed)
+        pool = library(pusher, with_near(replace(scene, tool=blade)), goals, begin, seed, zones)
     return env, ExcavateParams(scene, pool, **params)
 
 

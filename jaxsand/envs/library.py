@@ -1,6 +1,6 @@
 """Pools of goals for many strokes, made once: of random strokes, glyphs, or height maps, on level or on rough sand."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.envs.multi import LevelGoals, MultiStroke, RoughGoals
-from jaxsand.envs.pushing import Pushing
+from jaxsand.envs.zones import NoZones, Zones
 from jaxsand.goals import metrics
 from jaxsand.goals.letters import stroke_list
 from jaxsand.goals.surfaces import rough_surface
@@ -93,7 +93,9 @@ Goals = RandomStrokes | Mapping[str, Any] | np.ndarray | jax.Array
 """Random strokes, or names with strokes [n, 4] of the unit square as a glyph file has them, or maps [G, H, W] (m)."""
 
 
-def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough, seed: int) -> LevelGoals | RoughGoals:
+def library(
+    env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough, seed: int, zones: Zones | None = None
+) -> LevelGoals | RoughGoals:
     """Makes the pool of goals that an environment draws from; strokes are pushed as the environment pushes them.
 
     Args:
@@ -102,6 +104,7 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
       goals: a `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, or maps [G, H, W] (m).
       starts: `Level()` or `Rough()`.
       seed: of all that is drawn.
+      zones: where the blade may not be; None for nowhere. Strokes are clipped or refused as the environment does.
 
     Returns:
       The goals as `LevelGoals`, or with the surfaces that they start from as `RoughGoals`.
@@ -136,7 +139,7 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
     else:
         raise ValueError(f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, or maps [G, H, W]")
     before = surfaces(scene, starts, count, rng)
-    after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans)
+    after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans, zones)
     return pool_from(starts, before, after)
 
 
@@ -162,17 +165,17 @@ def surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Gen
     return np.asarray(rested.height)
 
 
-def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray]) -> np.ndarray:
+def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray], zones: Zones | None) -> np.ndarray:
     """The maps [G, H, W] (m) after the strokes of each plan: [n, 4] of the unit square, or [n, 6] with heights in depths."""
     depth, square = float(blade_of(scene).depth), glyph_square(scene)
-    push = _program(env.pushing())
+    push, around = _program(env), NoZones() if zones is None else zones
     heights = jnp.asarray(maps)
     for k in range(max(map(len, plans))):
         ends = np.stack([some[min(k, len(some) - 1)].reshape(2, -1) for some in plans])
         placed = np.concatenate([metrics.place(ends[..., :2], square), ends[..., 2:] * depth], axis=2)
         strokes = placed.reshape(len(plans), -1).astype(np.float32)
-        after, _ = push(scene, heights, jnp.asarray(strokes))
-        due = jnp.array([k < len(some) for some in plans]) & jnp.all(jnp.isfinite(after), axis=(1, 2))
+        after = push(scene, heights, jnp.asarray(strokes), around)
+        due = jnp.array([k < len(some) for some in plans])
         heights = jnp.where(due[:, None, None], after, heights)
     return np.asarray(heights)
 
@@ -185,5 +188,8 @@ def glyph_square(scene: Scene) -> tuple[float, float]:
 
 
 @cache
-def _program(pushing: Pushing) -> Pushing:
-    return jax.jit(jax.vmap(pushing, in_axes=(None, 0, 0)))
+def _program(env: MultiStroke) -> Callable[[Scene, jax.Array, jax.Array, Zones], jax.Array]:
+    def one(scene: Scene, height: jax.Array, stroke: jax.Array, zones: Zones) -> jax.Array:
+        return env.pushed(scene, height, stroke, zones)[0]
+
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, None)))

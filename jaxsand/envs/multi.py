@@ -10,9 +10,9 @@ import numpy as np
 from jaxsand.envs import episode
 from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.heights import Heights, OwnDepth
-from jaxsand.envs.pushing import Batching, ByLength, Push, Pushing, pushing
+from jaxsand.envs.pushing import Batching, ByLength, Push, pushing
 from jaxsand.envs.spaces import Box, Dict
-from jaxsand.envs.zones import NoZones, Zones, kept
+from jaxsand.envs.zones import NoZones, Told, Zones, kept
 from jaxsand.goals import metrics
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
@@ -241,10 +241,6 @@ class MultiStroke:
         """How many numbers an action has."""
         return self.heights.size + self.stop.more
 
-    def pushing(self) -> Pushing:
-        """What a stroke does to one map, batched as `batching` says."""
-        return self.batching.batched(pushing(self.push, self.settle))
-
     def reset(self, key: jax.Array, params: StrokeParams) -> tuple[dict[str, jax.Array], StrokeState]:
         """Begins an episode; returns its first observation and its state."""
         start, goal = params.goals.draw(key)
@@ -263,12 +259,7 @@ class MultiStroke:
         action = jnp.asarray(action, state.height.dtype)
         if action.shape != (self.size,):
             raise ValueError(f"action: got shape {list(action.shape)}; give {self.size} numbers")
-        scene, push = params.scene, self.pushing()
-        blade = blade_of(scene)
-        stroke, told = params.zones.way(self.stroke(action, params), scene.grid, blade.width, blade.thickness)
-        after, outcome = push(scene, state.height, stroke)
-        after = jnp.where(jnp.all(jnp.isfinite(after)), after, state.height)
-        after, outcome = kept(told, "went", (state.height, jnp.zeros_like(outcome)), (after, outcome))
+        after, outcome, told = self.pushed(params.scene, state.height, self.stroke(action, params), params.zones)
         after, terminated = self.stop.over(action, state.height, after)
         new = StrokeState(state.goal, after, state.time + 1)
         reward = self.distance(state, params) - self.distance(new, params)
@@ -276,6 +267,15 @@ class MultiStroke:
         return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome} | told
 
     step = episode.step  # `step_env`, and the next episode begins where that ended one
+
+    def pushed(self, scene: Scene, height: jax.Array, stroke: jax.Array, zones: Zones) -> tuple[jax.Array, jax.Array, Told]:
+        """The map that a stroke [4] or [6] (m) leaves, its outcome, and what zones have to tell."""
+        blade = blade_of(scene)
+        way, told = zones.way(stroke, scene.grid, blade.width, blade.thickness)
+        after, outcome = self.batching.batched(pushing(self.push, self.settle))(scene, height, way)
+        after = jnp.where(jnp.all(jnp.isfinite(after)), after, height)
+        after, outcome = kept(told, "went", (height, jnp.zeros_like(outcome)), (after, outcome))
+        return after, outcome, told
 
     def distance(self, state: StrokeState, params: StrokeParams) -> jax.Array:
         """L, a scalar: the l2 distance of goal and map as measured, in units of the blade's depth (float32)."""

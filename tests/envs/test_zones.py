@@ -87,6 +87,15 @@ def test_derivatives_of_a_clipped_stroke_are_those_of_small_differences():
     assert min(np.abs(differences)) > 0
 
 
+def test_goals_are_made_around_zones():
+    """By the strokes that the environment would make of a glyph's."""
+    line = np.float32(np.array([[0.1, 0.5, 0.9, 0.5]]) * 0.125 + 0.0175)[0]
+    env, params = small(zones=envs.ClippedBy(RIGHT), goals={"line": [[0.1, 0.5, 0.9, 0.5]]})
+    after, _, info = made(env, params, line)
+    assert info["clipped"]
+    assert np.abs(after.height - params.goals.goals[0]).max() < 2e-6
+
+
 def test_a_tool_passes_through_walls_unless_they_are_zones():
     walls = js.Walls(np.arange(16) == np.full((16, 1), 8))
     scene = replace(SMALL, walls=walls)
