@@ -10,7 +10,7 @@ import pytest
 import jaxsand as js
 from jaxsand import envs
 
-from .cases import KEY, SMALL, program, rising, small
+from .cases import KEY, SMALL, level, program, rising, small
 
 DEPTH = SMALL.tool.depth
 
@@ -26,7 +26,7 @@ def test_an_action_is_a_stroke_of_six_numbers_between_the_heights():
     assert action.shape == (7,)
     assert float(action[6]) == -1
     assert np.abs(with_stop.stroke(action, params) - stroke).max() < 1e-12
-    low, _ = small(heights=envs.Heights(-1.0, 0.0))
+    low, _ = level(heights=envs.Heights(-1.0, 0.0))
     assert low.stroke(jnp.zeros(6), params)[2::3].tolist() == pytest.approx([-DEPTH / 2] * 2)
 
 
@@ -38,12 +38,9 @@ def test_a_stroke_is_the_simulators():
         _, state, *_, info = program(env)(KEY, state, env.action(jnp.float32(stroke), params), params)
         assert int(info["outcome"]) == 0
         assert np.abs(state.height - expected.height).max() < 2e-6
-    level, own = small(), js.step(SMALL, np.zeros((16, 16), "float32"), stroke[:2] + stroke[3:5], push=env.push)
-    _, flat, *_ = program(level[0])(
-        KEY, level[0].reset(KEY, level[1])[1], level[0].action(jnp.float32(stroke[:2] + stroke[3:5]), level[1]), level[1]
-    )
-    _, same, *_ = program(env)(KEY, env.reset(KEY, params)[1], env.action(jnp.float32(stroke), params), params)
-    assert np.abs(flat.height - own.height).max() < 2e-6
+    plain, own = level()
+    flat = program(plain)(KEY, plain.reset(KEY, own)[1], plain.action(jnp.float32(stroke[:2] + stroke[3:5]), own), own)[1]
+    same = program(env)(KEY, env.reset(KEY, params)[1], env.action(jnp.float32(stroke), params), params)[1]
     assert np.abs(flat.height - same.height).max() < 2e-6  # at its own depth a stroke with heights is one without
 
 

@@ -10,7 +10,7 @@ import pytest
 import jaxsand as js
 from jaxsand import envs
 
-from .cases import KEY, SMALL, program, rising, small
+from .cases import KEY, SMALL, level, program, rising, small
 
 RIGHT = np.arange(16) >= np.full((16, 1), 9)
 THROUGH = jnp.float32([0.03, 0.055, 0.13, 0.055])  # from the left half into the right
@@ -23,7 +23,7 @@ def made(env, params, stroke):
     return after, float(reward), info
 
 
-@pytest.mark.parametrize("make", [small, pytest.param(rising, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("make", [level, pytest.param(rising, marks=pytest.mark.slow)])
 def test_a_stroke_ends_at_the_edge_of_a_zone(make):
     free, clipped = make(), make(zones=envs.ClippedBy(RIGHT))
     stroke, end = THROUGH, THROUGH.at[2].set(EDGE)
@@ -46,7 +46,7 @@ def test_a_stroke_ends_at_the_edge_of_a_zone(make):
 
 
 def test_what_may_not_be_made_leaves_the_map_and_counts():
-    refused, clipped = small(zones=envs.RefusedBy(RIGHT)), small(zones=envs.ClippedBy(RIGHT))
+    refused, clipped = level(zones=envs.RefusedBy(RIGHT)), level(zones=envs.ClippedBy(RIGHT))
     for one, stroke in ((refused, THROUGH), (clipped, THROUGH[jnp.array([2, 3, 0, 1])])):  # the second begins in the zone
         after, reward, info = made(*one, stroke)
         assert (bool(info["clipped"]), float(info["went"]), reward, int(info["outcome"])) == (True, 0, 0, 0)
@@ -61,7 +61,7 @@ def test_what_may_not_be_made_leaves_the_map_and_counts():
 
 def test_a_batch_is_its_maps_and_each_may_have_its_zones():
     cells = np.stack([RIGHT, ~RIGHT, RIGHT.T])
-    env, params = small(zones=envs.ClippedBy(RIGHT))
+    env, params = level(zones=envs.ClippedBy(RIGHT))
     axes = replace(jax.tree.map(lambda _: None, params), zones=envs.ClippedBy(0))
     state = env.reset(KEY, params)[1]
     many = jax.jit(jax.vmap(env.step_env, (None, None, None, axes)))(
@@ -76,7 +76,7 @@ def test_a_batch_is_its_maps_and_each_may_have_its_zones():
 
 @pytest.mark.slow
 def test_derivatives_of_a_clipped_stroke_are_those_of_small_differences():
-    env, params = small(zones=envs.ClippedBy(RIGHT), goals=envs.LevelGoals(jnp.zeros((1, 16, 16))))
+    env, params = level(zones=envs.ClippedBy(RIGHT), goals=envs.LevelGoals(jnp.zeros((1, 16, 16))))
     weight = jnp.asarray(np.random.default_rng(0).normal(size=(16, 16)))
     state = env.reset(KEY, params)[1]
     left = jax.jit(lambda action: (program(env)(KEY, state, action, params)[1].height * weight).sum())
@@ -99,10 +99,10 @@ def test_goals_are_made_around_zones():
 def test_a_tool_passes_through_walls_unless_they_are_zones():
     walls = js.Walls(np.arange(16) == np.full((16, 1), 8))
     scene = replace(SMALL, walls=walls)
-    after, _, _ = made(*small(scene=scene), THROUGH)
+    after, _, _ = made(*level(scene=scene), THROUGH)
     beyond = np.asarray(after.height)[:, 9:]
     assert beyond.min() < -0.005  # the blade dug on the other side
-    after, _, info = made(*small(scene=scene, zones=envs.ClippedBy(walls.solid)), THROUGH)
+    after, _, info = made(*level(scene=scene, zones=envs.ClippedBy(walls.solid)), THROUGH)
     assert info["clipped"]
     assert not np.asarray(after.height)[:, 8:].any()
     assert np.asarray(after.height)[:, :8].min() < -0.005
@@ -111,10 +111,10 @@ def test_a_tool_passes_through_walls_unless_they_are_zones():
 def test_without_zones_nothing_is_computed_for_them():
     sizes = []
     for zones in (envs.NoZones(), envs.RefusedBy(RIGHT), envs.ClippedBy(RIGHT)):
-        env, params = small(zones=zones)
+        env, params = level(zones=zones)
         state = env.reset(KEY, params)[1]
         sizes.append(len(jax.make_jaxpr(env.step_env)(KEY, state, jnp.zeros(4, "float32"), params).eqns))
-    env, params = small()
+    env, params = level()
     state = env.reset(KEY, params)[1]
     bare = len(jax.make_jaxpr(env.step_env)(KEY, state, jnp.zeros(4, "float32"), params).eqns)
     assert bare == sizes[0] < sizes[1] < sizes[2]
@@ -131,4 +131,4 @@ def test_without_zones_nothing_is_computed_for_them():
 )
 def test_what_are_no_zones_is_said(zones, message):
     with pytest.raises(ValueError, match=message):
-        small(zones=zones)
+        level(zones=zones)
