@@ -1,7 +1,7 @@
 """How many steps a second the environments make: in a batch, and as Gymnasium's users make them, one by one.
 
-Actions are random, over the whole map of 32 x 32 cells where they are strokes; episodes are so short that new ones begin all
-the time.
+Actions are random, over the whole map of 32 x 32 cells where they are strokes or digs; episodes are so short that new ones
+begin all the time.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from jaxsand.bench.timing import race, timed
-from jaxsand.envs import LevelGoals, OnSand, Together, Walks, make, pool_of
+from jaxsand.envs import Heights, LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.stroke_loss import pushed
@@ -26,7 +26,8 @@ from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.window import AsNeeded, Whole
 
 Row = dict[str, Any]
-_FULL, _FAST, _MAP, _SAND = KINDS = "full push", "fast push", "walk on a map", "walk on sand"
+KINDS = "full push", "push with heights", "dig", "fast push", "walk on a map", "walk on sand"
+_FULL, _RISING, _DIG, _FAST, _MAP, _SAND = KINDS
 _VMAP, _SHARED, _LOOP = "vmap", ", a share to each device", "Gymnasium, one by one"
 _QUICK = {"sub-step 1/4, 2 sweeps": SteppedPush(1 / 4, 2), "sub-step 1/8, 2 sweeps": SteppedPush(1 / 8, 2)}  # see bench push
 _LOOSE = {"0.01 above repose": UntilStill(1e-2), "8 sweeps": Sweeps(8)}  # a push may be settled less well
@@ -87,9 +88,10 @@ def bench_env(batch: int = 1024, tell: Tell = quiet, kinds: tuple[str, ...] = KI
 def _made(kind: str) -> tuple[tuple[Any, Any], dict[str, Any]]:
     """The environment of a kind with its parameters, and the options that make it."""
     level = LevelGoals(jnp.zeros((1, 32, 32), jnp.float32))
-    if kind in (_FULL, _FAST):
-        options: dict[str, Any] = {"goals": level} | ({"push": SwathPush()} if kind == _FAST else {})
-        return make("multi-stroke", **options), options
+    if kind in (_FULL, _RISING, _DIG, _FAST):
+        more: dict[str, Any] = {_RISING: {"heights": Heights()}, _FAST: {"push": SwathPush()}}
+        options = {"goals": level} | more.get(kind, {})
+        return make("excavate" if kind == _DIG else "multi-stroke", **options), options
     options = {"goals": pool_of(Walks(), jax.random.key(0), 256)} | ({"on": OnSand()} if kind == _SAND else {})
     return make("single-stroke", **options), options
 
@@ -147,10 +149,11 @@ def _error(loose: Any, env: Any, params: Any) -> float:
 def _gymnasium(kind: str, options: dict[str, Any]) -> list[Contender]:
     """A single environment, step by step, as an agent's loop has it; nothing without Gymnasium."""
     try:
-        from jaxsand.envs.gymnasium import MultiStrokeEnv, SingleStrokeEnv
+        from jaxsand.envs.gymnasium import ExcavateEnv, MultiStrokeEnv, SingleStrokeEnv
     except ImportError:
         return []
-    env = (MultiStrokeEnv if kind in (_FULL, _FAST) else SingleStrokeEnv)(**options)
+    entries: dict[str, Any] = {_DIG: ExcavateEnv, _MAP: SingleStrokeEnv, _SAND: SingleStrokeEnv}
+    env = entries.get(kind, MultiStrokeEnv)(**options)
     env.action_space.seed(0)
     env.reset(seed=0)
 

@@ -5,10 +5,16 @@ parameters, and the leaves of both may be vmapped; see `episode.Environment`.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import Field, fields
-from typing import Any, Literal, overload
+from dataclasses import Field, fields, replace
+from typing import Any, Literal, TypeVar, overload
 
-from jaxsand.envs.checks import check_kinds, check_limit, check_ready_goals, check_scene
+import jax
+import jax.numpy as jnp
+
+from jaxsand.envs.checks import check_heights, check_kinds, check_limit, check_ready_goals, check_scene, check_zones
+from jaxsand.envs.digs import RandomDigs, dug
+from jaxsand.envs.excavate import Excavate, ExcavateParams, ExcavateState
+from jaxsand.envs.heights import Heights, OwnDepth
 from jaxsand.envs.library import Goals, Level, RandomStrokes, Rough, library
 from jaxsand.envs.maps import MapPool, Walks, map_pool, pool_of
 from jaxsand.envs.multi import (
@@ -26,18 +32,26 @@ from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.envs.onsand import OnSand, SandParams, SandState
 from jaxsand.envs.pushing import ByLength, Together
 from jaxsand.envs.spaces import Box, Dict, Discrete
+from jaxsand.envs.zones import ClippedBy, NoZones, RefusedBy
 from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.blade_stepped import with_near
+from jaxsand.interaction.bucket import bucket_of
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, blade_of, make_scene
+from jaxsand.scene.tools import Blade, Bucket
 from jaxsand.scene.window import Whole, Window
 
 __all__ = [
     "Box",
     "ByLength",
+    "ClippedBy",
     "Dict",
     "Discrete",
+    "Excavate",
+    "ExcavateParams",
+    "ExcavateState",
+    "Heights",
     "Level",
     "LevelGoals",
     "MapParams",
@@ -45,10 +59,14 @@ __all__ = [
     "MapState",
     "MultiStroke",
     "NoStop",
+    "NoZones",
     "OnMap",
     "OnSand",
     "OnlyDug",
+    "OwnDepth",
+    "RandomDigs",
     "RandomStrokes",
+    "RefusedBy",
     "Rough",
     "RoughGoals",
     "SandParams",
@@ -65,7 +83,9 @@ __all__ = [
     "pool_of",
 ]
 
-_WINDOW = (12, 12)
+_WINDOW, _BUCKET_WINDOW = (12, 12), (16, 16)
+_BUCKET = Bucket(width=0.04, length=0.04, capacity=4e-5)
+_CREEP = 5e-3  # spacings: what a heap that settled by the default tolerance still creeps while the bucket moves by one
 
 
 @overload
@@ -78,6 +98,10 @@ def make(name: Literal["single-stroke"], *, on: OnMap | None = None, **options: 
 
 @overload
 def make(name: Literal["multi-stroke"], **options: Any) -> tuple[MultiStroke, StrokeParams]: ...
+
+
+@overload
+def make(name: Literal["excavate"], **options: Any) -> tuple[Excavate, ExcavateParams]: ...
 
 
 @overload
@@ -95,8 +119,8 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
     too.
 
     Args:
-      name: "single-stroke", a walk of the tool over the cells of a binary map, or "multi-stroke", straight pushes from
-        anywhere to anywhere.
+      name: "single-stroke", a walk of the tool over the cells of a binary map; "multi-stroke", straight pushes from
+        anywhere to anywhere; or "excavate", digs of a bucket that scoops here and dumps there.
       **options: for "single-stroke": `on`, `OnMap()` (a binary map, the default) or `OnSand()` (the simulator); `goals`, a
         `Walks()` or a `MapPool` (see `map_pool`, `pool_of`); `step_cost`; `limit`, steps after which an episode is
         truncated; and, with `OnSand()`, the `scene`. For "multi-stroke": the fields of `MultiStroke`; `goals`, a
@@ -104,7 +128,10 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
         `jaxsand.task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no berms);
         `starts`, a `Level()` or `Rough(relief)`; `seed`, for both; `scene`, by default 32 x 32 cells of 0.01 m with the
         default blade, and a window of 12 x 12 cells that is computed around the blade while it is down; `limit`, strokes
-        after which an episode is truncated.
+        after which an episode is truncated; `zones`, where the blade may not be: `ClippedBy(cells)` or `RefusedBy(cells)`.
+        For "excavate": the fields of `Excavate`, and `goals` (also a `RandomDigs()`, the default), `starts`, `seed`, `scene`
+        (by default with a bucket 0.04 m wide that holds 4e-5 m^3), `limit` and `zones`, as for "multi-stroke"; strokes are
+        pushed by a blade as wide as the bucket.
 
     Returns:
       The environment, static and hashable, and its parameters, a pytree.
@@ -129,7 +156,9 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
             return _single(**options)
         case "multi-stroke":
             return _multi(**options)
-    raise ValueError(f"name: got {name!r}; give single-stroke or multi-stroke")
+        case "excavate":
+            return _excavate(**options)
+    raise ValueError(f"name: got {name!r}; give single-stroke, multi-stroke or excavate")
 
 
 def _single(
@@ -163,24 +192,68 @@ def _multi(
     **options: Any,
 ) -> tuple[MultiStroke, StrokeParams]:
     """Many strokes with the given options."""
-    own = {f.name for f in fields(MultiStroke)}
-    chosen = {key: value for key, value in options.items() if key in own}
-    check_kinds(chosen)
-    env = MultiStroke(**chosen)
-    params = {key: value for key, value in options.items() if key not in own}
-    _known("multi-stroke", params, (f for f in fields(StrokeParams) if f.name == "limit"))
-    check_limit(params)
-    check_whole("seed", seed, 0)
+    env, params = _of_kind("multi-stroke", MultiStroke, options, seed)
     if scene is None:
         window = Window(_WINDOW) if isinstance(env.push, SteppedPush) else Whole()
         scene = usual_scene(window=window)
     check_scene(scene)
+    check_heights(env, blade_of(scene))
+    zones = params.get("zones", NoZones())
+    check_zones(scene, zones)
     scene = with_near(scene)
     if isinstance(goals, LevelGoals | RoughGoals):
         check_ready_goals(scene, goals, starts)
+        pool: LevelGoals | RoughGoals = jax.tree.map(jnp.asarray, goals)
     else:
-        goals = library(env, scene, RandomStrokes() if goals is None else goals, Level() if starts is None else starts, seed)
-    return env, StrokeParams(scene, goals, **params)
+        begin = Level() if starts is None else starts
+        pool = library(env, scene, RandomStrokes() if goals is None else goals, begin, seed, zones)
+    return env, StrokeParams(scene, pool, **params)
+
+
+def _excavate(
+    goals: RandomDigs | Goals | LevelGoals | RoughGoals | None = None,
+    starts: Level | Rough | None = None,
+    scene: Scene | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> tuple[Excavate, ExcavateParams]:
+    """Excavation with the given options."""
+    env, params = _of_kind("excavate", Excavate, options, seed)
+    if scene is None:
+        scene = usual_scene(tool=_BUCKET, window=Window(_BUCKET_WINDOW, _CREEP))
+    check_scene(scene, bucket_of)
+    check_heights(env, bucket_of(scene))
+    zones = params.get("zones", NoZones())
+    check_zones(scene, zones)
+    bucket, dx = bucket_of(scene), scene.grid.spacing
+    scene = replace(scene, window=with_near(replace(scene, tool=Blade(bucket.width, dx, bucket.depth))).window)
+    begin = Level() if starts is None else starts
+    if isinstance(goals, LevelGoals | RoughGoals):
+        check_ready_goals(scene, goals, starts)
+        pool: LevelGoals | RoughGoals = jax.tree.map(jnp.asarray, goals)
+    elif goals is None or isinstance(goals, RandomDigs):
+        pool = dug(env, scene, RandomDigs() if goals is None else goals, begin, seed, zones)
+    else:
+        blade = Blade(bucket.width, jnp.maximum(Blade().thickness, dx), bucket.depth)
+        pusher = MultiStroke(env.push, batching=env.batching, settle=env.settle)
+        pool = library(pusher, with_near(replace(scene, tool=blade)), goals, begin, seed, zones)
+    return env, ExcavateParams(scene, pool, **params)
+
+
+Env = TypeVar("Env", MultiStroke, Excavate)
+
+
+def _of_kind(name: str, kind: type[Env], options: Mapping[str, Any], seed: int) -> tuple[Env, dict[str, Any]]:
+    """An environment with those of the options that are its fields, and the others, which are its parameters'."""
+    own = {f.name for f in fields(kind)}
+    chosen = {key: value for key, value in options.items() if key in own}
+    params = {key: value for key, value in options.items() if key not in own}
+    check_kinds(chosen)
+    _known(name, params, (f for f in fields(StrokeParams) if f.name in ("limit", "zones")))
+    check_kinds(params)
+    check_limit(params)
+    check_whole("seed", seed, 0)
+    return kind(**chosen), params
 
 
 def _known(name: str, options: Mapping[str, object], some: Iterable[Field[Any]]) -> None:

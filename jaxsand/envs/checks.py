@@ -1,20 +1,26 @@
 """Checks of what `make` is given, before anything is computed from it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, get_args
 
 import jax
 import numpy as np
 
+from jaxsand.envs.excavate import Excavate
+from jaxsand.envs.heights import Heights, OwnDepth
 from jaxsand.envs.maps import MapGoals
-from jaxsand.envs.multi import LevelGoals, NoStop, OnlyDug, RoughGoals, Stop, WithBerms
+from jaxsand.envs.multi import LevelGoals, MultiStroke, NoStop, OnlyDug, RoughGoals, Stop, WithBerms
 from jaxsand.envs.onmap import OnMap
 from jaxsand.envs.onsand import OnSand
 from jaxsand.envs.pushing import Batching, Push
+from jaxsand.envs.zones import NoZones, Zones
 from jaxsand.goals.metrics import finite
+from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
+from jaxsand.scene.masked import unmasked
 from jaxsand.scene.scene import Scene, blade_of
+from jaxsand.scene.tools import Blade, Bucket
 from jaxsand.scene.validation import concrete
 
 _KINDS: dict[str, Any] = {
@@ -24,6 +30,8 @@ _KINDS: dict[str, Any] = {
     "measure": WithBerms | OnlyDug,
     "batching": Batching,
     "settle": StopRule | None,
+    "heights": OwnDepth | Heights,
+    "zones": Zones,
     "goals": MapGoals,
 }
 
@@ -45,11 +53,12 @@ def check_limit(options: Mapping[str, object]) -> None:
             raise ValueError(f"limit: got {options['limit']!r}; give 1 step or more to an episode")
 
 
-def check_scene(scene: object) -> None:
-    """Raises ValueError unless it is a scene whose tool is a blade."""
+def check_scene(scene: object, tool_of: Callable[[Scene], Blade | Bucket] = blade_of) -> None:
+    """Raises ValueError unless it is a scene with the right tool, by default a blade."""
     if not isinstance(scene, Scene):
-        raise ValueError(f"scene: got {scene!r:.60}; give make_scene(..., tool=Blade())")
-    blade_of(scene)
+        tool = "Blade()" if tool_of is blade_of else "Bucket(width, length, capacity)"
+        raise ValueError(f"scene: got {scene!r:.60}; give make_scene(..., tool={tool})")
+    tool_of(scene)
 
 
 def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: object) -> None:
@@ -64,3 +73,27 @@ def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: obje
             finite(maps, field.name)
     if starts is not None:
         raise ValueError(f"starts: got {starts!r} beside goals that are ready; leave it out, or give strokes as goals")
+
+
+def check_heights(env: MultiStroke | Excavate, tool: Blade | Bucket) -> None:
+    """Raises ValueError unless the push can change the tool's height, and its depth is one to measure heights in."""
+    if isinstance(env.heights, OwnDepth):
+        if isinstance(env, MultiStroke):
+            return
+        raise ValueError(f"heights: got {env.heights}; a bucket scoops between heights: give Heights(lowest, highest)")
+    if not isinstance(env.push, SteppedPush):
+        raise ValueError(f"push: got {env.push!r}, which keeps its tool at one depth; give SteppedPush() with Heights()")
+    depth = concrete(tool.depth)
+    if depth is not None and not np.all(depth > 0):
+        raise ValueError(f"scene.tool.depth: got {depth} m; give a depth above 0, of which Heights() are multiples")
+
+
+def check_zones(scene: Scene, zones: Zones) -> None:
+    """Raises ValueError for zones that are not booleans of the scene's shape; traced ones are not checked."""
+    if isinstance(zones, NoZones):
+        return
+    cells = concrete(unmasked("zones.cells", zones.cells, "say of each whether the tool may be there: cells.filled(True)"))
+    if cells is not None and (cells.dtype != bool or cells.shape != scene.grid.shape):
+        raise ValueError(
+            f"zones.cells: got {cells.dtype} of shape {list(cells.shape)}; give booleans of shape {list(scene.grid.shape)}"
+        )

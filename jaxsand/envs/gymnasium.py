@@ -28,15 +28,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from jaxsand.envs import Box, MultiStroke, OnMap, OnSand, make
+from jaxsand.envs import Box, Excavate, Heights, MultiStroke, OnMap, OnSand, make
 
 SINGLE, MULTI = "jaxsand/SingleStroke-v0", "jaxsand/MultiStroke-v0"
+HEIGHTS, EXCAVATE = "jaxsand/MultiStrokeHeights-v0", "jaxsand/Excavate-v0"
 _LOW, _LEVEL, _HIGH, _TOOL = (np.array(c, float) for c in ((30, 60, 130), (222, 196, 150), (110, 60, 20), (200, 30, 30)))
 _PIXELS = 256  # along a panel of a picture, about
 _AT_HOME = os.getpid()  # the process that this module was imported in
 
 Obs = dict[str, Any]
-Core = OnMap | OnSand | MultiStroke
+Core = OnMap | OnSand | MultiStroke | Excavate
 
 
 def _refuse_forks() -> None:
@@ -144,11 +145,12 @@ class SingleStrokeEnv(_Sand):
 
 
 class MultiStrokeEnv(_Sand):
-    """Many strokes as a Gymnasium goal environment, "jaxsand/MultiStroke-v0".
+    """Many strokes as a Gymnasium goal environment, "jaxsand/MultiStroke-v0", or "jaxsand/MultiStrokeHeights-v0".
 
     Observations are maps [H, W] in units of the blade's depth: "observation" and "achieved_goal", both the sand as it lies,
     and "desired_goal". An action holds x0, y0, x1, y1 from -1 to 1, from the first to the last cell centre of the map;
-    numbers beyond that push from off the map.
+    numbers beyond that push from off the map. With `heights=Heights()`, the default of the second name, it holds x0, y0, z0,
+    x1, y1, z1.
 
     The reward is L_t - L_{t+1}, with L = sqrt(sum (goal - h)^2). It depends on the map before the push, which is in
     info["previous"]. So an algorithm that relabels goals must keep the infos (Stable-Baselines3:
@@ -226,13 +228,37 @@ class MultiStrokeEnv(_Sand):
         return np.sqrt(np.sum(apart.reshape(len(apart), -1) ** 2, axis=1))
 
 
+class ExcavateEnv(_Sand):
+    """Excavation as a Gymnasium environment, "jaxsand/Excavate-v0".
+
+    Observations are the maps "goal" and "current" [H, W] in units of the bucket's depth, and "load", what the bucket holds
+    as a share of its capacity. An action holds x0, y0, z0, x1, y1, z1 of a scoop, x, y of a dump, and the share that is
+    poured, from -1 to 1; see `jaxsand.env.Excavate`.
+
+    Args:
+      render_mode: "rgb_array" or None.
+      **options: those of `jaxsand.make("excavate", ...)`.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
+      >>> env = js.gym.ExcavateEnv(goals=np.zeros((1, 32, 32)))
+      >>> obs, info = env.reset(seed=0)
+      >>> obs["current"].shape, float(obs["load"]), env.action_space.shape
+      ((32, 32), 0.0, (9,))
+    """
+
+    task = "excavate"
+
+
 class SandVectorEnv(VectorEnv):
     """Many environments as one vmapped program, for `gymnasium.make_vec`.
 
-    Observations and actions are those of `SingleStrokeEnv` or `MultiStrokeEnv`, with a first axis of length num_envs.
+    Observations and actions are those of `SingleStrokeEnv`, `MultiStrokeEnv` or `ExcavateEnv`, with a first axis of length
+    num_envs.
 
     Args:
-      task: "single-stroke" or "multi-stroke".
+      task: "single-stroke", "multi-stroke" or "excavate".
       num_envs: how many.
       render_mode: "rgb_array" or None.
       **options: those of `jaxsand.make`.
@@ -315,7 +341,7 @@ class SandVectorEnv(VectorEnv):
         infos = {}
         if "action_mask" in info:  # of the state as it is now
             infos = _masked({"action_mask": info.pop("action_mask")}, np.ones(self.num_envs, bool))
-        else:
+        if isinstance(self.core, MultiStroke):
             info["previous"] = self.shown["current"]
         infos |= _masked(info, ~over)
         if over.any():
@@ -391,8 +417,8 @@ def _box(box: Box) -> spaces.Box:
 
 
 def _view(shown: Obs) -> Obs:
-    """The observation under Gymnasium's names: a goal dictionary for many strokes."""
-    if "pose" in shown:
+    """The observation under Gymnasium's names: a goal dictionary for many strokes, which hold two maps and no more."""
+    if len(shown) > 2:
         return dict(shown)
     return {"observation": shown["current"], "achieved_goal": shown["current"], "desired_goal": shown["goal"]}
 
@@ -415,7 +441,7 @@ def _programs(core: Core, step: Callable[..., Any]) -> tuple[Callable[..., Any],
     """`reset` and a step of one environment, with the mask of actions in the info where it has one."""
 
     def about(state: Any, params: Any) -> Obs:
-        return {} if isinstance(core, MultiStroke) else {"action_mask": core.legal(state, params).astype(np.int8)}
+        return {"action_mask": core.legal(state, params).astype(np.int8)} if isinstance(core, OnMap | OnSand) else {}
 
     def begin(key: jax.Array, params: Any) -> tuple[Any, Any, Obs]:
         obs, state = core.reset(key, params)
@@ -442,5 +468,11 @@ def _together(core: Core) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return jax.jit(jax.vmap(begin, (0, None))), jax.jit(jax.vmap(go_on, (0, 0, 0, None)))
 
 
-for _name, _single in ((SINGLE, SingleStrokeEnv), (MULTI, MultiStrokeEnv)):
-    gymnasium.register(_name, entry_point=_single, vector_entry_point=partial(SandVectorEnv, _single.task))
+_ENTRIES: tuple[tuple[str, type[_Sand], dict[str, Any]], ...] = (
+    (SINGLE, SingleStrokeEnv, {}),
+    (MULTI, MultiStrokeEnv, {}),
+    (HEIGHTS, MultiStrokeEnv, {"heights": Heights()}),
+    (EXCAVATE, ExcavateEnv, {}),
+)
+for _name, _single, _given in _ENTRIES:
+    gymnasium.register(_name, entry_point=_single, vector_entry_point=partial(SandVectorEnv, _single.task), kwargs=_given)

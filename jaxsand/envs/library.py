@@ -1,6 +1,6 @@
 """Pools of goals for many strokes, made once: of random strokes, glyphs, or height maps, on level or on rough sand."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.envs.multi import LevelGoals, MultiStroke, RoughGoals
-from jaxsand.envs.pushing import Pushing
+from jaxsand.envs.zones import NoZones, Zones
 from jaxsand.goals import metrics
 from jaxsand.goals.letters import stroke_list
 from jaxsand.goals.surfaces import rough_surface
@@ -18,7 +18,7 @@ from jaxsand.interaction.outcome import check
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.masked import gaps
-from jaxsand.scene.scene import Scene
+from jaxsand.scene.scene import Scene, blade_of
 
 _TRIES = 16
 _GLYPH_MAP = 0.32  # m: the side of the map that the glyphs' square is given for
@@ -93,7 +93,9 @@ Goals = RandomStrokes | Mapping[str, Any] | np.ndarray | jax.Array
 """Random strokes, or names with strokes [n, 4] of the unit square as a glyph file has them, or maps [G, H, W] (m)."""
 
 
-def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough, seed: int) -> LevelGoals | RoughGoals:
+def library(
+    env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough, seed: int, zones: Zones | None = None
+) -> LevelGoals | RoughGoals:
     """Makes the pool of goals that an environment draws from; strokes are pushed as the environment pushes them.
 
     Args:
@@ -102,6 +104,7 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
       goals: a `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, or maps [G, H, W] (m).
       starts: `Level()` or `Rough()`.
       seed: of all that is drawn.
+      zones: where the blade may not be; None for nowhere. Strokes are clipped or refused as the environment does.
 
     Returns:
       The goals as `LevelGoals`, or with the surfaces that they start from as `RoughGoals`.
@@ -117,8 +120,6 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
       >>> pool.goals.shape
       (2, 8, 8)
     """
-    if not isinstance(starts, Level | Rough):
-        raise ValueError(f"starts: got {starts!r}; give Level() or Rough()")
     if isinstance(goals, np.ndarray | jax.Array):
         goals = np.asarray(gaps(goals))
     rng = np.random.default_rng(seed)
@@ -130,22 +131,29 @@ def library(env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough,
         metrics.fits(scene, goals[0], "goals")
         plans, count = [], len(goals)
     elif isinstance(goals, RandomStrokes):
-        plans, count = goals.plans(rng), goals.goals
+        plans, count = env.heights.drawn(rng, goals.plans(rng)), goals.goals
     elif isinstance(goals, Mapping):
         plans, count = [stroke_list("goals", name, goals[name]) for name in goals], len(goals)
         if not plans:
             raise ValueError("goals: got no glyph; give names with strokes [[x0, y0, x1, y1], ...]")
     else:
         raise ValueError(f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, or maps [G, H, W]")
-    before = _surfaces(scene, starts, count, rng)
-    after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans)
+    before = surfaces(scene, starts, count, rng)
+    after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans, zones)
+    return pool_from(starts, before, after)
+
+
+def pool_from(starts: Level | Rough, before: np.ndarray, after: np.ndarray) -> LevelGoals | RoughGoals:
+    """The pool of goals `after` [G, H, W] (m) that were made from the surfaces `before`."""
     if isinstance(starts, Level):
         return LevelGoals(jnp.asarray(after))
     return RoughGoals(jnp.asarray(after), jnp.asarray(before))
 
 
-def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Generator) -> np.ndarray:
+def surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Generator) -> np.ndarray:
     """The surfaces [count, H, W] (m) to start from, at rest."""
+    if not isinstance(starts, Level | Rough):
+        raise ValueError(f"starts: got {starts!r}; give Level() or Rough()")
     shape = (count, *scene.grid.shape)
     if isinstance(starts, Level):
         return np.zeros(shape, np.float32)
@@ -157,20 +165,31 @@ def _surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Ge
     return np.asarray(rested.height)
 
 
-def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray]) -> np.ndarray:
-    """The maps [G, H, W] (m) after the strokes of each plan, which are given in the unit square."""
-    side = min(scene.grid.shape) * float(scene.grid.spacing) / _GLYPH_MAP
-    low, high = (edge * side for edge in metrics.GLYPH_SQUARE)
-    push = _program(env.batching.pushing(env.push, env.settle))
+def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray], zones: Zones | None) -> np.ndarray:
+    """The maps [G, H, W] (m) after the strokes of each plan: [n, 4] of the unit square, or [n, 6] with heights in depths."""
+    depth, square = float(blade_of(scene).depth), glyph_square(scene)
+    push, around = _program(env), NoZones() if zones is None else zones
     heights = jnp.asarray(maps)
     for k in range(max(map(len, plans))):
-        strokes = np.stack([metrics.place(some[min(k, len(some) - 1)], (low, high)) for some in plans]).astype(np.float32)
-        after, _ = push(scene, heights, jnp.asarray(strokes))
-        due = jnp.array([k < len(some) for some in plans]) & jnp.all(jnp.isfinite(after), axis=(1, 2))
+        ends = np.stack([some[min(k, len(some) - 1)].reshape(2, -1) for some in plans])
+        placed = np.concatenate([metrics.place(ends[..., :2], square), ends[..., 2:] * depth], axis=2)
+        strokes = placed.reshape(len(plans), -1).astype(np.float32)
+        after = push(scene, heights, jnp.asarray(strokes), around)
+        due = jnp.array([k < len(some) for some in plans])
         heights = jnp.where(due[:, None, None], after, heights)
     return np.asarray(heights)
 
 
+def glyph_square(scene: Scene) -> tuple[float, float]:
+    """The lowest and highest x and y (m) of the square on the scene's map in which glyphs and drawn strokes lie."""
+    side = min(scene.grid.shape) * float(scene.grid.spacing) / _GLYPH_MAP
+    low, high = metrics.GLYPH_SQUARE
+    return low * side, high * side
+
+
 @cache
-def _program(pushing: Pushing) -> Pushing:
-    return jax.jit(jax.vmap(pushing, in_axes=(None, 0, 0)))
+def _program(env: MultiStroke) -> Callable[[Scene, jax.Array, jax.Array, Zones], jax.Array]:
+    def one(scene: Scene, height: jax.Array, stroke: jax.Array, zones: Zones) -> jax.Array:
+        return env.pushed(scene, height, stroke, zones)[0]
+
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, None)))

@@ -1,6 +1,7 @@
 """Many strokes: each action is a straight push from anywhere to anywhere on the map, after which the sand settles."""
 
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -8,17 +9,21 @@ import numpy as np
 
 from jaxsand.envs import episode
 from jaxsand.envs.episode import Action, Step
-from jaxsand.envs.pushing import Batching, ByLength, Push
+from jaxsand.envs.heights import Heights, OwnDepth
+from jaxsand.envs.pushing import Batching, ByLength, Push, pushing
 from jaxsand.envs.spaces import Box, Dict
+from jaxsand.envs.zones import NoZones, Told, Zones, kept
 from jaxsand.goals import metrics
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of
 
+Tree = TypeVar("Tree")
+
 
 @dataclass(frozen=True)
 class NoStop:
-    """Tells `MultiStroke` that an episode ends only when it is truncated, the default.
+    """Tells an environment that an episode ends only when it is truncated, the default.
 
     Example:
       >>> import jaxsand as js
@@ -26,17 +31,17 @@ class NoStop:
       NoStop()
     """
 
-    size = 4  # numbers of an action
+    more = 0  # numbers of an action besides those of what it does
 
-    def over(self, action: jax.Array, before: jax.Array, after: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The map after an action, and whether that ended the episode."""
+    def over(self, action: jax.Array, before: Tree, after: Tree) -> tuple[Tree, jax.Array]:
+        """What an action leaves, and whether it ended the episode."""
         del action, before
         return after, jnp.zeros((), bool)
 
 
 @dataclass(frozen=True)
 class Stop:
-    """Tells `MultiStroke` that actions have a fifth number, which ends the episode in place of a push when it is above 0.
+    """Tells an environment that actions have one number more, which ends the episode in place of a push when it is above 0.
 
     Example:
       >>> import numpy as np
@@ -46,17 +51,17 @@ class Stop:
       (5,)
     """
 
-    size = 5  # numbers of an action
+    more = 1  # numbers of an action besides those of what it does
 
-    def over(self, action: jax.Array, before: jax.Array, after: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The map after an action, and whether that ended the episode."""
-        stop = action[4] > 0
-        return jnp.where(stop, before, after), stop
+    def over(self, action: jax.Array, before: Tree, after: Tree) -> tuple[Tree, jax.Array]:
+        """What an action leaves, and whether it ended the episode."""
+        stop = action[-1] > 0
+        return jax.tree.map(lambda old, new: jnp.where(stop, old, new), before, after), stop
 
 
 @dataclass(frozen=True)
 class WithBerms:
-    """Tells `MultiStroke` to compare maps as they are, the default: for goals that strokes made.
+    """Tells an environment to compare maps as they are, the default: for goals that strokes made.
 
     Example:
       >>> import jax.numpy as jnp
@@ -72,7 +77,7 @@ class WithBerms:
 
 @dataclass(frozen=True)
 class OnlyDug:
-    """Tells `MultiStroke` to compare what is dug, min(h, 0): for goals that are drawn without berms.
+    """Tells an environment to compare what is dug, min(h, 0): for goals that are drawn without berms.
 
     Example:
       >>> import jax.numpy as jnp
@@ -170,6 +175,7 @@ class StrokeParams:
       scene: grid, sand and a `Blade`.
       goals: what an episode draws its goal and its start from.
       limit: strokes after which an episode is truncated.
+      zones: where the blade may not be: `NoZones()`, `ClippedBy(cells)` or `RefusedBy(cells)`.
 
     Example:
       >>> import numpy as np
@@ -182,6 +188,7 @@ class StrokeParams:
     scene: Scene
     goals: LevelGoals | RoughGoals
     limit: jax.Array | int = 6
+    zones: Zones = field(default_factory=NoZones)
 
 
 @dataclass(frozen=True)
@@ -189,14 +196,17 @@ class MultiStroke:
     """An environment of straight pushes: each action is a stroke, after which the sand settles.
 
     An action holds x0, y0, x1, y1, each from -1 to 1, from the first to the last cell centre of the map; numbers beyond that
-    push from off the map. Observations are the maps "goal" and "current" [H, W] in units of the blade's depth (float32).
+    push from off the map. With `Heights()` it holds x0, y0, z0, x1, y1, z1, where z, the height of the blade's bottom, rises
+    or sinks evenly on the way, from -1 to 1 between heights that the blade's depth gives. Observations are the maps "goal"
+    and "current" [H, W] in units of the blade's depth (float32).
 
     With L = sqrt(sum (goal - h)^2), of the maps as `measure` sees them and in units of the blade's depth, the reward is
     L_t - L_{t+1}. An episode is truncated after `limit` strokes, and terminated when a `Stop` asks for it. `info` holds the
-    simulator's "outcome"; a push that leaves a map that is not finite counts as a stroke and leaves the map as it was.
+    simulator's "outcome", and with zones "clipped" and "went"; see `ClippedBy`. A push that leaves a map that is not finite,
+    leads straight up or down, or may not be made, counts as a stroke and leaves the map as it was.
 
     The reward is differentiable once, in forward and reverse mode, in the action, the state's maps and the scene's floats
-    (but not where the map equals the goal, nor in the fifth number of a `Stop`), whatever the batching.
+    (but not where the map equals the goal, nor in the number of a `Stop`), whatever the batching.
 
     Args:
       push: `SteppedPush()` (the full push, the default) or `SwathPush()` (fast).
@@ -204,6 +214,7 @@ class MultiStroke:
       measure: `WithBerms()` or `OnlyDug()`.
       batching: `ByLength()` (for a CPU, the default) or `Together()` (for a GPU).
       settle: when settling stops; None means when the sand is still.
+      heights: `OwnDepth()` (the default) or `Heights()`.
 
     Example:
       >>> import jax
@@ -223,6 +234,12 @@ class MultiStroke:
     measure: WithBerms | OnlyDug = field(default_factory=WithBerms)
     batching: Batching = field(default_factory=ByLength)
     settle: StopRule | None = None
+    heights: OwnDepth | Heights = field(default_factory=OwnDepth)
+
+    @property
+    def size(self) -> int:
+        """How many numbers an action has."""
+        return self.heights.size + self.stop.more
 
     def reset(self, key: jax.Array, params: StrokeParams) -> tuple[dict[str, jax.Array], StrokeState]:
         """Begins an episode; returns its first observation and its state."""
@@ -240,18 +257,25 @@ class MultiStroke:
         """
         del key
         action = jnp.asarray(action, state.height.dtype)
-        if action.shape != (self.stop.size,):
-            raise ValueError(f"action: got shape {list(action.shape)}; give {self.stop.size} numbers")
-        push = self.batching.pushing(self.push, self.settle)
-        after, outcome = push(params.scene, state.height, self.stroke(action, params))
-        after = jnp.where(jnp.all(jnp.isfinite(after)), after, state.height)
+        if action.shape != (self.size,):
+            raise ValueError(f"action: got shape {list(action.shape)}; give {self.size} numbers")
+        after, outcome, told = self.pushed(params.scene, state.height, self.stroke(action, params), params.zones)
         after, terminated = self.stop.over(action, state.height, after)
         new = StrokeState(state.goal, after, state.time + 1)
         reward = self.distance(state, params) - self.distance(new, params)
         truncated = (new.time >= params.limit) & ~terminated
-        return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome}
+        return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome} | told
 
     step = episode.step  # `step_env`, and the next episode begins where that ended one
+
+    def pushed(self, scene: Scene, height: jax.Array, stroke: jax.Array, zones: Zones) -> tuple[jax.Array, jax.Array, Told]:
+        """The map that a stroke [4] or [6] (m) leaves, its outcome, and what zones have to tell."""
+        blade = blade_of(scene)
+        way, told = zones.way(stroke, scene.grid, blade.width, blade.thickness)
+        after, outcome = self.batching.batched(pushing(self.push, self.settle))(scene, height, way)
+        after = jnp.where(jnp.all(jnp.isfinite(after)), after, height)
+        after, outcome = kept(told, "went", (height, jnp.zeros_like(outcome)), (after, outcome))
+        return after, outcome, told
 
     def distance(self, state: StrokeState, params: StrokeParams) -> jax.Array:
         """L, a scalar: the l2 distance of goal and map as measured, in units of the blade's depth (float32)."""
@@ -259,17 +283,14 @@ class MultiStroke:
         return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def stroke(self, action: jax.Array, params: StrokeParams) -> jax.Array:
-        """The stroke x0, y0, x1, y1 (m), [4], of an action."""
-        cells, spacing = _cells(params).astype(action.dtype), jnp.asarray(params.scene.grid.spacing, action.dtype)
-        return (0.5 + (action[:4] + 1) / 2 * cells) * spacing
+        """The stroke (m) of an action, before zones: x0, y0, x1, y1 [4], or x0, y0, z0, x1, y1, z1 [6] with `Heights`."""
+        return self.heights.stroke(action[: self.heights.size], params.scene.grid, blade_of(params.scene).depth)
 
     def action(self, stroke: jax.typing.ArrayLike, params: StrokeParams) -> jax.Array:
-        """The action of a stroke x0, y0, x1, y1 (m); with a `Stop` its fifth number is -1, which goes on."""
+        """The action of a stroke [4] or [6] (m), as of `stroke`; with a `Stop` its last number is -1, which goes on."""
         stroke = jnp.asarray(stroke)
-        steps = stroke / jnp.asarray(params.scene.grid.spacing, stroke.dtype) - 0.5
-        return jnp.concatenate(
-            [2 * steps / _cells(params).astype(steps.dtype) - 1, -jnp.ones(self.stop.size - 4, steps.dtype)]
-        )
+        numbers = self.heights.action(stroke, params.scene.grid, blade_of(params.scene).depth)
+        return jnp.concatenate([numbers, -jnp.ones(self.stop.more, stroke.dtype)])
 
     def observe(self, state: StrokeState, params: StrokeParams) -> dict[str, jax.Array]:
         """The observation of a state: its two maps, in units of the blade's depth (float32)."""
@@ -279,14 +300,8 @@ class MultiStroke:
     def action_space(self, params: StrokeParams) -> Box:
         """The space of actions."""
         del params
-        return Box(-1, 1, (self.stop.size,))
+        return Box(-1, 1, (self.size,))
 
     def observation_space(self, params: StrokeParams) -> Dict:
         """The space of observations."""
         return Dict({name: Box(-jnp.inf, jnp.inf, params.scene.grid.shape) for name in ("goal", "current")})
-
-
-def _cells(params: StrokeParams) -> jax.Array:
-    """The distance from the first to the last cell centre in spacings, for x0, y0, x1, y1: integers [4]."""
-    rows, columns = params.scene.grid.shape
-    return jnp.array([columns - 1, rows - 1, columns - 1, rows - 1])

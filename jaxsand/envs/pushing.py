@@ -30,13 +30,16 @@ from jaxsand.relaxation.stopping import Stop, check_whole
 from jaxsand.scene.scene import Scene, cast
 
 Push = SteppedPush | SwathPush
-Pushing = Callable[[Scene, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
-"""From a scene, a map [H, W] (m) and a stroke [4] (m) to the map it leaves and its outcome."""
+Pushing = Callable[[Scene, Any, jax.Array], tuple[Any, jax.Array]]
+"""From a scene, a map [H, W] (m), or a tree with one, and a stroke to what is left and its outcome.
+
+A stroke is [4] or [6] (m); more numbers may follow the six.
+"""
 
 
 @dataclass(frozen=True)
 class Together:
-    """Tells `MultiStroke` to push a batch all at once, which takes as long as its longest stroke: suits a GPU.
+    """Tells an environment to push a batch all at once, which takes as long as its longest stroke: suits a GPU.
 
     Example:
       >>> import numpy as np
@@ -46,14 +49,14 @@ class Together:
       Together()
     """
 
-    def pushing(self, push: Push, stop: Stop | None) -> Pushing:
-        """The push of one map, to be vmapped as it is."""
-        return _alone(push, stop)
+    def batched(self, alone: Pushing) -> Pushing:
+        """What is done to one map, to be vmapped as it is."""
+        return alone
 
 
 @dataclass(frozen=True)
 class ByLength:
-    """Tells `MultiStroke` to push a batch in chunks of maps with strokes of like length: suits a CPU.
+    """Tells an environment to push a batch in chunks of maps with strokes of like length: suits a CPU.
 
     Args:
       chunk: maps to a chunk.
@@ -72,16 +75,16 @@ class ByLength:
     def __post_init__(self) -> None:
         check_whole("chunk", self.chunk, 1)
 
-    def pushing(self, push: Push, stop: Stop | None) -> Pushing:
-        """The push of one map, which vmap batches by length."""
-        return by_length(self, _alone(push, stop))
+    def batched(self, alone: Pushing) -> Pushing:
+        """What is done to one map, which vmap batches by length."""
+        return by_length(self, alone)
 
 
 Batching = Together | ByLength
 
 
 @cache
-def _alone(push: Push, stop: Stop | None) -> Pushing:
+def pushing(push: Push, stop: Stop | None) -> Pushing:
     """The push of one map: the map that it leaves, and the outcome."""
 
     def one(scene: Scene, height: jax.Array, stroke: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -95,27 +98,27 @@ def _alone(push: Push, stop: Stop | None) -> Pushing:
 def by_length(way: ByLength, alone: Pushing) -> Pushing:
     """A push that vmap batches by length, and so its derivatives."""
 
-    def of_floats(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[Callable[..., Any], Any]:
+    def of_floats(scene: Scene, before: Any, stroke: jax.Array) -> tuple[Callable[..., Any], Any]:
         """The map that is left as a function of all floats, and these."""
         floats, merge = split((scene, stroke))
 
-        def left(floats: Any, before: jax.Array) -> jax.Array:
+        def left(floats: Any, before: Any) -> Any:
             scene, stroke = merge(floats)
             return alone(scene, before, stroke)[0]
 
         return left, (floats, before)
 
-    def tangent(scene: Scene, before: jax.Array, stroke: jax.Array, *tangents: Any) -> jax.Array:
+    def tangent(scene: Scene, before: Any, stroke: jax.Array, *tangents: Any) -> Any:
         return jax.jvp(*of_floats(scene, before, stroke), tangents)[1]
 
-    def cotangent(scene: Scene, before: jax.Array, stroke: jax.Array, gain: jax.Array) -> tuple[Any, jax.Array]:
+    def cotangent(scene: Scene, before: Any, stroke: jax.Array, gain: Any) -> tuple[Any, Any]:
         left, at = of_floats(scene, before, stroke)
         return jax.vjp(left, *at)[1](gain)
 
     many, forwards, backwards = (sorted_by_length(way, f) for f in (alone, tangent, cotangent))
 
     @jax.custom_jvp
-    def pushed(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def pushed(scene: Scene, before: Any, stroke: jax.Array) -> tuple[Any, jax.Array]:
         return many(scene, before, stroke)
 
     @pushed.defjvp
@@ -139,9 +142,9 @@ def by_length(way: ByLength, alone: Pushing) -> Pushing:
         after, outcome = many(*primals)
         return (after, outcome), (dheight, np.zeros(outcome.shape, jax.dtypes.float0))
 
-    def cast_first(scene: Scene, before: jax.Array, stroke: jax.Array) -> tuple[jax.Array, jax.Array]:
-        before = jnp.asarray(before)
-        return pushed(cast(scene, before.dtype), before, jnp.asarray(stroke, before.dtype))
+    def cast_first(scene: Scene, before: Any, stroke: jax.Array) -> tuple[Any, jax.Array]:
+        dtype = jnp.result_type(jax.tree.leaves(before)[0])
+        return pushed(cast(scene, dtype), cast(before, dtype), jnp.asarray(stroke, dtype))
 
     return cast_first
 
@@ -156,7 +159,9 @@ def sorted_by_length(way: ByLength, alone: Callable[..., Any]) -> Callable[..., 
         leaves, tree = jax.tree.flatten(of_one)
         mapped = jax.tree.leaves(batched)
         stroke = jnp.asarray(of_one[2])
-        length = jnp.hypot(stroke[..., 2] - stroke[..., 0], stroke[..., 3] - stroke[..., 1])
+        ends = stroke[..., :6].reshape(*stroke.shape[:-1], 2, -1)
+        run = ends[..., 1, :2] - ends[..., 0, :2]
+        length = jnp.hypot(run[..., 0], run[..., 1])
         order = jnp.argsort(jnp.broadcast_to(-length, (size,)))
         chunk = min(way.chunk, size)
         chunks = -(-size // chunk)

@@ -150,7 +150,7 @@ def _scoop(
     record: Record | None = None,
 ) -> tuple[Loaded, Tree]:
     """`scoop`, and what `record` returned after each leg."""
-    bucket = _bucket(scene)
+    bucket = bucket_of(scene)
     if push is not None and not isinstance(push, SteppedPush):
         raise ValueError(f"push: got {push!r}; a bucket scoops by SteppedPush(substep, sweeps)")
     edge = replace(scene, tool=Blade(bucket.width, scene.grid.spacing, bucket.depth))
@@ -206,7 +206,7 @@ def dump(
         >>> print(f"{js.load_volume(scene, poured.load):.0e} {poured.height[10:12, 10:12].mean():.3f}")
         0e+00 0.013
     """
-    _bucket(scene)
+    bucket_of(scene)
     if amount is not None:
         check_amount("amount", amount, "give what to pour, or None for all of it")
     scheme, stop = check_rule(scene, scheme, stop)
@@ -232,7 +232,7 @@ def load_volume(scene: Scene, load: Load | None) -> Float[Array, "*batch"]:
     return (held.high + held.low) * dx.astype(held.high.dtype) ** 2
 
 
-def _bucket(scene: Scene) -> Bucket:
+def bucket_of(scene: Scene) -> Bucket:
     check_scene(scene)
     if not isinstance(scene.tool, Bucket):
         raise ValueError(

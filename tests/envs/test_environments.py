@@ -10,12 +10,14 @@ import pytest
 
 import jaxsand as js
 from jaxsand import envs
-from jaxsand.envs.pushing import ByLength, sorted_by_length
+from jaxsand.envs.pushing import ByLength, pushing, sorted_by_length
 
-from .cases import KEY, QUICK, SMALL, on_sand, program, small, walks
+from .cases import KEY, QUICK, SMALL, digging, on_sand, program, rising, small, walks
 
 SLOW = pytest.mark.slow
-each = pytest.mark.parametrize("make", [walks, pytest.param(on_sand, marks=SLOW), small])
+each = pytest.mark.parametrize(
+    "make", [walks, pytest.param(on_sand, marks=SLOW), small, pytest.param(rising, marks=SLOW), digging]
+)
 
 
 def batch(env, params, count):
@@ -51,7 +53,11 @@ def test_a_new_episode_begins_where_one_ended(make):
     key, (obs, state) = KEY, env.reset(KEY, params)
     for time in (1, 2):
         key, own = jax.random.split(key)
-        action = jnp.argmax(env.legal(state, params)) if hasattr(env, "legal") else jnp.float32([-0.5, 0, 0.5, 0.1])
+        action = (
+            jnp.argmax(env.legal(state, params))
+            if hasattr(env, "legal")
+            else jnp.linspace(-0.5, 0.4, env.size, dtype="float32")
+        )
         alone = go_on(own, state, action, params)
         obs, state, reward, terminated, truncated, info = step(own, state, action, params)
         chex.assert_trees_all_close(info["final_observation"], alone[0], atol=1e-5)
@@ -167,7 +173,7 @@ def test_sorting_a_batch_changes_no_map(size, chunk):
 
 @pytest.mark.usefixtures("both_ways")
 def test_a_batch_by_length_is_its_maps():
-    push = ByLength(2).pushing(QUICK, js.Sweeps(8))
+    push = ByLength(2).batched(pushing(QUICK, js.Sweeps(8)))
     rng = np.random.default_rng(1)
     strokes, maps = rng.uniform(0.02, 0.14, (5, 4)).astype("float32"), np.zeros((5, 16, 16), "float32")
     many, outcome = jax.jit(jax.vmap(push, (None, 0, 0)))(SMALL, maps, strokes)

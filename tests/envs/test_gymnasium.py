@@ -14,12 +14,16 @@ from jaxsand.envs import LevelGoals, OnlyDug, OnSand, Stop, Together, Walks, map
 from jaxsand.goals.letters import letter_map
 from jaxsand.interaction.stepped import SteppedPush
 
+from .cases import SCOOPING
+
 POOL = map_pool([letter_map(name)[0] for name in "LT"])
 RAISED = np.zeros((2, 32, 32), np.float32)
 RAISED[0, 10:12, 8:20] = -0.0075
 RAISED[1, 8:20, 10:12] = -0.0075
 GOALS = LevelGoals(RAISED)
+SLOW = pytest.mark.slow
 QUICK = {"goals": GOALS, "push": SteppedPush(1.0, 1), "batching": Together()}
+DIGS = {"goals": LevelGoals(RAISED[:, :16, :16]), "scene": SCOOPING, "push": SteppedPush(1.0, 1), "batching": Together()}
 
 
 def single(**options):
@@ -30,7 +34,15 @@ def multi(**options):
     return gymnasium.make(jaxsand.gym.MULTI, **QUICK | options)
 
 
-@pytest.mark.parametrize("make", [single, multi])
+def rising(**options):
+    return gymnasium.make(jaxsand.gym.HEIGHTS, **QUICK | options)
+
+
+def digging(**options):
+    return gymnasium.make(jaxsand.gym.EXCAVATE, **DIGS | options)
+
+
+@pytest.mark.parametrize("make", [single, multi, pytest.param(rising, marks=SLOW), digging])
 def test_gymnasium_finds_nothing_wrong(make):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*(infinity|render_fps).*")  # heights have no bounds
@@ -84,6 +96,22 @@ def test_the_reward_is_that_of_the_goal_and_works_on_a_batch(measure):
         env.unwrapped.compute_reward(achieved, desired, [{}] * 3)
 
 
+def test_heights_are_six_numbers_unless_told_otherwise():
+    assert rising().action_space.shape == (6,)
+    assert rising(heights=jaxsand.env.OwnDepth()).action_space.shape == (4,)
+
+
+@SLOW
+def test_zones_are_told_of():
+    cells = np.zeros((32, 32), bool)
+    cells[:, 16:] = True
+    env = rising(zones=jaxsand.env.ClippedBy(cells))
+    env.reset(seed=0)
+    *_, info = env.step(np.array([-0.5, 0, -0.5, 0.5, 0.1, -0.3], np.float32))
+    assert info["clipped"]
+    assert 0 < info["went"] < 1
+
+
 def test_masks_say_where_the_walk_may_go():
     env = single()
     _, info = env.reset(seed=1)
@@ -98,9 +126,17 @@ def test_masks_say_where_the_walk_may_go():
         assert info["legal"]
 
 
-@pytest.mark.parametrize("name", [jaxsand.gym.SINGLE, jaxsand.gym.MULTI])
-def test_a_vector_is_as_many_single_ones(name):
-    options = {"goals": POOL, "limit": 3} if name == jaxsand.gym.SINGLE else QUICK | {"limit": 3}
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        (jaxsand.gym.SINGLE, {"goals": POOL}),
+        (jaxsand.gym.MULTI, QUICK),
+        pytest.param(jaxsand.gym.HEIGHTS, QUICK, marks=SLOW),
+        pytest.param(jaxsand.gym.EXCAVATE, DIGS, marks=SLOW),
+    ],
+)
+def test_a_vector_is_as_many_single_ones(name, options):
+    options = options | {"limit": 3}
     envs = gymnasium.make_vec(name, num_envs=3, **options)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     alone = [gymnasium.make(name, **options) for _ in range(3)]
@@ -123,7 +159,7 @@ def test_a_vector_is_as_many_single_ones(name):
     assert truncated.all()
     assert info["_final_obs"].all()
     assert info["_final_info"].all()
-    assert not obs["current" if "pose" in obs else "observation"].sum((1, 2)).any() or "pose" in obs
+    assert "pose" in obs or not obs["current" if "current" in obs else "observation"].sum((1, 2)).any()
     assert envs.observation_space.contains(obs)
 
 
@@ -182,8 +218,8 @@ def test_stable_baselines_finds_nothing_wrong():
     check = pytest.importorskip("stable_baselines3.common.env_checker").check_env
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        check(multi().unwrapped)
-        check(single().unwrapped)
+        for make in (multi, rising, digging, single):
+            check(make().unwrapped)
 
 
 def test_forked_processes_are_told_what_to_do_instead_of_hanging(monkeypatch):

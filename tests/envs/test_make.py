@@ -71,7 +71,7 @@ def test_only_what_is_dug_counts_for_drawn_goals():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: js.make("sand"), "^name: got 'sand'; give single-stroke or multi-stroke"),
+        (lambda: js.make("sand"), "^name: got 'sand'; give single-stroke, multi-stroke or excavate"),
         (lambda: js.make("multi-stroke", wind=1, goals=np.zeros((1, 32, 32))), "^wind: no option of multi-stroke"),
         (lambda: js.make("single-stroke", wind=1), "^wind: no option of single-stroke"),
         (lambda: js.make("single-stroke", scene=SMALL), "^scene: has no effect on a binary map"),
