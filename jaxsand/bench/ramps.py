@@ -12,13 +12,14 @@ from jaxsand.interaction.outcome import check
 from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Actions, Flat, Rising
+from jaxsand.planning.stroke_loss import GRADIENT
 from jaxsand.relaxation.settling import settle
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 
-_SHAPE, _SPACING = (32, 64), 0.01
-_START, _END, _SIDES = 0.17, 0.47, (0.085, 0.235)  # of the ramp and the pad (m)
+_SHAPE, _SPACING = (16, 32), 0.02
+_START, _END, _SIDES = 0.18, 0.48, (0.08, 0.24)  # of the ramp and the pad (m)
 _RISE = 0.06
 KINDS = ("one depth", "a depth each", "rising")
 
@@ -50,7 +51,7 @@ class Work:
 
 
 def ramp(name: str, level: float, depth: float, trial: dict[str, float]) -> Work:
-    """A ramp 0.3 m long and 0.15 m wide that climbs 60 mm, from sand at `level` (m) over its foot, which lies at 0."""
+    """A ramp 0.3 m long and 0.16 m wide that climbs 60 mm, from sand at `level` (m) over its foot, which lies at 0."""
     x, inside = _ground()
     slope = _RISE * (x - _START) / (_END - _START) - level
     return Work(name, _scene(), np.zeros(_SHAPE, np.float32), np.where(inside, slope, np.nan), depth, trial)
@@ -59,7 +60,7 @@ def ramp(name: str, level: float, depth: float, trial: dict[str, float]) -> Work
 def pad() -> Work:
     """A level square of the ramp's size in rough ground of 40 mm relief, at the ground's mean height there."""
     _, inside = _ground()
-    rough = settle(_scene(), rough_surface(np.random.default_rng(5), _SHAPE, 0.04, 2.0).astype(np.float32))
+    rough = settle(_scene(), rough_surface(np.random.default_rng(5), _SHAPE, 0.04, 1.0).astype(np.float32))
     check(rough)
     height = np.asarray(rough.height)
     return Work("pad", _scene(), height, np.where(inside, height[inside].mean(), np.nan), 0.0, {})
@@ -79,29 +80,51 @@ def bench_ramps(
     some: tuple[Work, ...] | None = None,
     strokes: int = 24,
     per_stroke: int = 200,
-    steps: int = 40,
+    steps: int = 30,
     seed: int = 0,
-) -> list[dict[str, Any]]:
-    """Each kind of strokes on each piece of earth: by search, and then by gradients.
+) -> dict[str, list[dict[str, Any]]]:
+    """Each kind of strokes on each piece of earth: by search, and rising ones then by gradients.
 
     Errors are means of |height - goal| in mm, where the goal counts. A search has `per_stroke` pushes to each stroke, and
-    gradients what `steps` of them cost. `trial` is what a first trial reached, on an older push and with a search of its
+    gradients what `steps` of them cost. `trial_mm` is what a first trial reached, on an older push and with a search of its
     own.
+
+    Returns:
+      The rows, as `ramp`; and as `ramp_maps` what rising strokes leave of each piece, lists [H, W] (m), to be drawn.
     """
-    rows = []
+    rows, maps = [], []
     for work in works() if some is None else some:
         for kind in KINDS:
             tell(f"{work.name}: {kind}")
-            rows.append(_row(work, kind, strokes, per_stroke, steps, seed, tell))
-    return rows
+            row, height = _row(work, kind, (strokes, per_stroke, steps), seed, tell)
+            rows.append(row)
+        maps.append({"task": work.name, "after": height.tolist()})
+    return {"ramp": rows, "ramp_maps": maps}
 
 
-def _row(work: Work, kind: str, strokes: int, per_stroke: int, steps: int, seed: int, tell: Tell) -> dict[str, Any]:
+def shown(maps: list[dict[str, Any]]) -> list[tuple[str, Scene, dict[str, np.ndarray], np.ndarray]]:
+    """Of each piece of earth that `bench_ramps` tells of: its name, scene, maps by name, and the way up its middle (m)."""
+    known = {work.name: work for work in works()}
+    y = sum(_SIDES) / 2
+    found = []
+    for one in maps:
+        work = known[one["task"]]
+        some = {"before": work.height, "after": np.array(one["after"]), "goal": work.goal}
+        middle = np.nanmin(work.goal), np.nanmax(work.goal)
+        rise = (middle[1] - middle[0]) / (_END - _START - _SPACING)
+        ends = ((x, y, float(np.nanmean(work.goal)) + rise * (x - (_START + _END) / 2)) for x in (_START, _END))
+        found.append((work.name, work.scene, some, np.array([*ends])))
+    return found
+
+
+def _row(work: Work, kind: str, size: tuple[int, int, int], seed: int, tell: Tell) -> tuple[dict[str, Any], np.ndarray]:
+    """The row of one kind of strokes, with so many strokes, pushes for each, and steps of gradients; and what they leave."""
     kinds: dict[str, Actions] = {
         "one depth": Flat(lowest=-work.depth, highest=-work.depth),
         "a depth each": Flat(),
         "rising": Rising(),
     }
+    strokes, per_stroke, steps = size
     began = time.perf_counter()
     found = plan_sand(
         work.scene, work.height, work.goal, strokes=strokes, actions=kinds[kind], budget=per_stroke * strokes, seed=seed
@@ -112,22 +135,20 @@ def _row(work: Work, kind: str, strokes: int, per_stroke: int, steps: int, seed:
         "strokes": len(found.paths),
         "before_mm": work.error(work.height),
         "search_mm": work.error(found.height),
-        "pushes": found.effort.cost,
+        "gradients_mm": None,
         "trial_mm": work.trial.get(kind),
-        "search_seconds": time.perf_counter() - began,
+        "pushes": found.effort.cost,
+        "calls_of_gradients": None,
+        "seconds": time.perf_counter() - began,
     }
     if kind != "rising" or not found.paths or not steps:
-        return row
-    began = time.perf_counter()
-    budget = len(found.paths) * (1 + 5 * steps)
+        return row, found.height
+    budget = len(found.paths) * (1 + (1 + GRADIENT) * steps)
     refined = optimise_strokes(
         work.scene, work.goal, start=work.height, guess=found.strokes, budget=budget, key=seed, tell=tell
     )
-    return row | {
-        "gradients_mm": work.error(refined.height),
-        "calls": refined.spent,
-        "gradients_seconds": time.perf_counter() - began,
-    }
+    more = {"gradients_mm": work.error(refined.height), "calls_of_gradients": refined.spent}
+    return row | more | {"seconds": time.perf_counter() - began}, refined.height
 
 
 def _scene() -> Scene:

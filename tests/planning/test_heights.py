@@ -167,9 +167,11 @@ def test_bad_input(actions, message):
 
 def test_the_bench_tells_errors_of_what_is_built():
     """Of a ramp from its foot the mean error is half its rise at first, from half its height a quarter of it."""
-    assert ramp("", 0.03, 0.0, {}).error(np.zeros((32, 64))) == pytest.approx(15)
-    assert ramp("", 0.0, 0.0, {}).error(np.zeros((32, 64))) == pytest.approx(30)
-    rows = bench_ramps(some=(Work("small", SCENE, LEVEL, RAMP, 0.0, {"rising": 1.0}),), strokes=2, per_stroke=40, steps=0)
+    assert ramp("", 0.03, 0.0, {}).error(np.zeros((16, 32))) == pytest.approx(15)
+    assert ramp("", 0.0, 0.0, {}).error(np.zeros((16, 32))) == pytest.approx(30)
+    report = bench_ramps(some=(Work("small", SCENE, LEVEL, RAMP, 0.0, {"rising": 1.0}),), strokes=2, per_stroke=40, steps=0)
+    rows = report["ramp"]
+    assert np.shape(report["ramp_maps"][0]["after"]) == SHAPE
     assert [row["strokes_are"] for row in rows] == ["one depth", "a depth each", "rising"]
     assert rows[2]["search_mm"] < rows[1]["search_mm"] < rows[0]["search_mm"] == rows[0]["before_mm"]
     assert rows[2]["trial_mm"] == 1.0

@@ -5,6 +5,7 @@ plan is the best of many on the sand that those before it left; then the plan's 
 """
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from jaxsand.goals.metrics import still_to_do
 from jaxsand.planning.search.actions import Job, Path, longest_stroke, shares
@@ -16,6 +17,7 @@ _KEPT = 8  # of a stroke's trials, for others around them
 _AROUND = np.array([3.0, 3.0, 0.5, 3.0, 3.0, 0.5])  # how far these lie: in spacings, heights in the size of what is to do
 _GREEDY = 0.7  # of the budget is for the strokes one after the other; the rest varies them
 _VARIANTS = 16  # of a stroke at a time
+_PLACES = 17  # on a stroke's way at which the goal is looked at
 
 
 def search_heights(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
@@ -59,27 +61,29 @@ def propose_heights(job: Job, height: np.ndarray, count: int, rng: np.random.Gen
     """Draws random strokes [count, 6] (m) that may bring `height` [H, W] closer to the job's goal.
 
     A quarter each run from where sand can be had to where it is wanted, from there to anywhere that counts, between places
-    that count, and between any. Sand can be had where it lies above the goal, and where the goal is free. Ends lie near the
-    goal's height, or the sand's where the goal is free, and half of the starts lower.
+    that count, and between any. Sand can be had where it lies above the goal, and where the goal is free. The first are as
+    high as the goal at their ends, or as the sand where the goal is free, and half of them start lower. The others follow
+    the straight line that fits the goal best along their way. Two thirds are then moved a little up or down.
     """
     spacing = float(job.scene.grid.spacing)
     todo, free = still_to_do(height, job.goal), np.isnan(job.goal)
-    surface = np.where(free, height, job.goal)
     anywhere, none = np.full(todo.size, 1 / todo.size), np.zeros(todo.size)
     counts = shares(~free.ravel() * 1.0, anywhere)
     wanted = shares(-todo.ravel(), counts)
     had = shares(shares(todo.ravel(), none) + 0.5 * shares(free.ravel() * 1.0, none), anywhere)
-    size, many = _size(todo), count // 4 + 1
-    drawn = []
-    for pair in ((had, wanted), (had, counts), (counts, counts), (anywhere, anywhere)):
-        rows, columns = np.stack(
-            [np.unravel_index(rng.choice(todo.size, many, p=share), todo.shape) for share in pair], axis=1
-        )
-        place = (np.stack([columns, rows], axis=-1) + 0.5 + rng.normal(0, 2, (2, many, 2))) * spacing
-        z = surface[rows, columns] + rng.normal(0, 0.1, (2, many)) * size
-        z[0] -= np.where(rng.random(many) < 0.5, rng.exponential(size, many), 0)
-        drawn.append(np.concatenate([place[0], z[0, :, None], place[1], z[1, :, None]], axis=1))
-    return within(job, rng.permutation(np.concatenate(drawn))[:count])
+    many = count // 4 + 1
+    pairs = ((had, wanted), (had, counts), (counts, counts), (anywhere, anywhere))
+    cells = np.stack([[rng.choice(todo.size, many, p=share) for share in pair] for pair in pairs], axis=1)
+    rows, columns = np.unravel_index(cells.reshape(2, -1), todo.shape)
+    ends = np.stack([columns, rows], axis=-1) + rng.normal(0, 2, (2, 4 * many, 2))  # in cells, cell centres whole numbers
+    ends = np.clip(ends, 0, np.array(todo.shape[::-1]) - 1)
+    size = _size(todo)
+    z, z[:, :many] = _along(job.goal, height, ends), _at(np.where(free, height, job.goal), ends[:, :many])
+    z[0, :many] -= np.where(rng.random(many) < 0.5, rng.exponential(size, many), 0)
+    z += rng.normal(0, 0.1 * size, z.shape) * (rng.random(4 * many) < 2 / 3)
+    places = (ends + 0.5) * spacing
+    drawn = np.concatenate([places[0], z[0, :, None], places[1], z[1, :, None]], axis=1)
+    return within(job, rng.permutation(drawn)[:count])
 
 
 def around(
@@ -134,6 +138,28 @@ def _varied(job: Job, plan: np.ndarray, budget: float, rng: np.random.Generator)
             left, plan, way = ends[best], tried[best], np.concatenate([way[:k], maps[:, best]])
         turn += 1
     return plan[: int(distance(way, job.goal).argmin())], effort
+
+
+def _along(goal: np.ndarray, height: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Heights [2, n] (m) at the ends [2, n, 2] (cells) of strokes, on the line that fits the goal best on the way between.
+
+    Where a stroke meets fewer than two places that count, they are the sand's.
+    """
+    share = np.linspace(0, 1, _PLACES)[:, None]
+    found = _at(goal, ends[0] + share[..., None] * (ends[1] - ends[0]))
+    counts = np.isfinite(found)
+    many = np.maximum(counts.sum(0), 1)
+    middle, level = (np.where(counts, x, 0).sum(0) / many for x in (share, found))
+    apart = np.where(counts, share - middle, 0)
+    spread = (apart**2).sum(0)
+    slope = (apart * np.where(counts, found - level, 0)).sum(0) / np.where(spread > 0, spread, 1)
+    line = level + np.array([[0.0], [1.0]] - middle) * slope
+    return np.where(spread > 0, line, _at(height, ends))
+
+
+def _at(surface: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """A surface [H, W] at places [..., 2] (cells: column, row), interpolated; NaN beside cells that are NaN."""
+    return map_coordinates(surface, np.moveaxis(places[..., ::-1], -1, 0), order=1, mode="nearest")
 
 
 def _size(todo: np.ndarray) -> float:
