@@ -63,14 +63,15 @@ def pad() -> Work:
     rough = settle(_scene(), rough_surface(np.random.default_rng(5), _SHAPE, 0.04, 1.0).astype(np.float32))
     check(rough)
     height = np.asarray(rough.height)
-    return Work("pad", _scene(), height, np.where(inside, height[inside].mean(), np.nan), 0.0, {})
+    level = float(height[inside].mean())
+    return Work("pad", _scene(), height, np.where(inside, level, np.nan), -level, {})
 
 
 def works() -> tuple[Work, ...]:
     """All of them."""
     return (
-        ramp("ramp, from half its height", _RISE / 2, 0.0, {"one depth": 4.8, "a depth each": 1.9, "rising": 0.33}),
-        ramp("ramp, from its foot", 0.0, 0.0, {"one depth": 22.0, "a depth each": 7.7, "rising": 7.2}),
+        ramp("ramp, from half its height", _RISE / 2, 0.015, {"one depth": 4.8, "a depth each": 1.9, "rising": 0.33}),
+        ramp("ramp, from its foot", 0.0, 0.015, {"one depth": 22.0, "a depth each": 7.7, "rising": 7.2}),
         pad(),
     )
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_BEYOND = 6  # spacings that are drawn on both sides of a path
 _LOOKS: tuple[dict[str, Any], ...] = (
     {"color": "0.55", "ls": "--", "lw": 1.2},
     {"color": "tab:brown", "lw": 2.0},
@@ -74,9 +75,16 @@ def sides_figure(shown: list[tuple[str, Scene, dict[str, np.ndarray], np.ndarray
 
 
 def draw_along(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: np.ndarray) -> None:
-    """Draws maps [H, W] (m) in mm over the distance (m) along a path [n, 2] or [n, 3] (m), with the tool at both ends."""
-    far, points = _walked(path, float(scene.grid.spacing) / 2)
-    _profiles(axes, scene, maps, far, points)
+    """Draws maps [H, W] (m) in mm over the distance (m) along a path [n, 2] or [n, 3] (m), with the tool at both ends.
+
+    The sand is drawn a little beyond the ends too.
+    """
+    spacing = float(scene.grid.spacing)
+    far, points = _walked(path, spacing / 2)
+    beyond = np.arange(1, 2 * _BEYOND) * spacing / 2
+    before, after = (points[a] + beyond[:, None] * _ahead(points[a] - points[b]) for a, b in ((0, 1), (-1, -2)))
+    wide = np.concatenate([-beyond[::-1], far, far[-1] + beyond])
+    _profiles(axes, scene, maps, wide, np.concatenate([before[::-1], points, after]))
     z = _bottom(scene.tool, path, far)
     if not isinstance(scene.tool, NoTool):
         axes.plot(far, 1e3 * z, ":", color="black", lw=1.0, label="the tool's bottom")
@@ -94,8 +102,7 @@ def draw_across(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: n
     spacing = float(scene.grid.spacing)
     far, points = _walked(path, spacing / 2)
     at = min(round(share * (len(far) - 1)), len(far) - 2)
-    ahead = points[at + 1] - points[at]
-    ahead /= np.hypot(*ahead)
+    ahead = _ahead(points[at + 1] - points[at])
     outline = tool_outline(scene.tool, across=True)
     reach = max(2 * float(np.abs(outline[:, 0]).max(initial=0)), 8 * spacing)
     left = np.arange(-reach, reach + spacing / 4, spacing / 2)
@@ -103,6 +110,7 @@ def draw_across(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: n
     z = _bottom(scene.tool, path, far)[at]
     axes.fill(outline[:, 0], 1e3 * (z + outline[:, 1]), color="0.3", alpha=0.25, lw=0)
     axes.set(xlabel="to the left of the path (m)")
+    axes.locator_params(axis="x", nbins=5)
 
 
 def section(height: np.ndarray, spacing: float, points: np.ndarray) -> np.ndarray:
@@ -149,11 +157,11 @@ def _profiles(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], far: np.n
 
 
 def _walked(path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [k] (m) along a path, about `step` apart, and the points [k, 2] (m) there."""
+    """Distances [k] (m) along a path, at its corners and about `step` apart, and the points [k, 2] (m) there."""
     path = _checked(path)
     legs = np.hypot(*np.diff(path[:, :2], axis=0).T)
     at = np.concatenate([[0], np.cumsum(legs)])
-    far = np.linspace(0, at[-1], max(2, math.ceil(at[-1] / step) + 1))
+    far = np.union1d(np.linspace(0, at[-1], max(2, math.ceil(at[-1] / step) + 1)), at)
     return far, np.stack([np.interp(far, at, path[:, k]) for k in (0, 1)], axis=1)
 
 
@@ -165,6 +173,12 @@ def _bottom(tool: Tool, path: np.ndarray, far: np.ndarray) -> np.ndarray:
         return np.full(len(far), -own)
     at = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
     return np.interp(far, at, path[:, 2])
+
+
+def _ahead(run: np.ndarray) -> np.ndarray:
+    """A vector [2] at length 1; of none, along x."""
+    length = np.hypot(*run)
+    return run / length if length > 0 else np.array([1.0, 0.0])
 
 
 def _checked(path: np.ndarray) -> np.ndarray:

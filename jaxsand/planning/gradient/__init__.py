@@ -251,11 +251,16 @@ def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Ge
 
 
 def downhill(account: Account, plans: moves.Plans) -> None:
-    """Moves plans by gradients alone: by Adam for two thirds of the budget, then by L-BFGS as long as that helps."""
-    if account.history:
-        steps = account.room(plans.strokes.shape[1]) // (1 + GRADIENT)
-        plans = moves.adam(account, plans, 2 * steps // 3, 0.15 * float(account.sand.scene.grid.spacing))
-        moves.quasi_newton(account, plans, steps)
+    """Moves plans by gradients alone, in turns of Adam, for two thirds of what is left of the budget, and of L-BFGS.
+
+    Each turn begins with steps half as long as the last one's, and they end where a turn no longer helps.
+    """
+    size, last = 0.15 * float(account.sand.scene.grid.spacing), math.inf
+    while account.history and account.afford(plans.strokes) and plans.losses[0] < last:
+        last, steps = float(plans.losses[0]), account.room(plans.strokes.shape[1]) // (1 + GRADIENT)
+        plans = moves.adam(account, plans, max(1, 2 * steps // 3), size)
+        plans = moves.quasi_newton(account, plans, steps)
+        size /= 2
 
 
 def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:
