@@ -157,11 +157,10 @@ def optimise_strokes(
     if account.before > 0 and plan is None:
         search(account, strokes, rng, most, smoothing)
     elif account.before > 0 and plan is not None and len(plan):
-        given = moves.Plans(plan[None], account.losses(plan[None]))
         if plan.shape[1] == 6:
-            downhill(account, given)
+            downhill(account, moves.Plans(plan[None], account.losses(plan[None])))
         else:
-            improve(account, print_of(account), given, rng, smoothing)
+            improve(account, print_of(account), moves.Plans(plan[None], account.losses(plan[None])), rng, smoothing)
     numbers = 4 if plan is None else plan.shape[1]
     steps = [
         Best(0, account.before, np.zeros((0, numbers))),

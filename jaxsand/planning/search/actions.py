@@ -108,9 +108,8 @@ class Flat:
     highest: float = math.inf
 
     def allowed(self, heights: np.ndarray) -> np.ndarray:
-        """Heights [n, 2] (m) at the ends of strokes, both their mean, within the bounds."""
-        mean = heights.mean(axis=1, keepdims=True)
-        return np.clip(np.repeat(mean, 2, axis=1), self.lowest, self.highest)
+        """Heights [n, 2] (m) at the ends of strokes, both the start's, within the bounds."""
+        return np.clip(np.repeat(heights[:, :1], 2, axis=1), self.lowest, self.highest)
 
 
 Actions = Lattice | Steps | Rising | Flat
