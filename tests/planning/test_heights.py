@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.bench.ramps import Work, bench_ramps, ramp
 from jaxsand.goals.metrics import fits_where_it_counts, still_to_do
 from jaxsand.planning.search import rollouts
 from jaxsand.planning.search.actions import Job
@@ -177,15 +176,3 @@ def test_plans_stay_on_the_map_and_heights_stay_as_they_are():
 def test_bad_input(actions, message):
     with pytest.raises(ValueError, match=message):
         js.plan_sand(SCENE, LEVEL, RAMP, actions=actions)
-
-
-def test_the_bench_tells_errors_of_what_is_built():
-    """Of a ramp from its foot the mean error is half its rise at first, from half its height a quarter, but for the odd row."""
-    assert ramp("", 0.03, 0.0, {}).error(np.zeros((16, 32))) == pytest.approx(15 - 1 / 15)
-    assert ramp("", 0.0, 0.0, {}).error(np.zeros((16, 32))) == pytest.approx(30)
-    report = bench_ramps(some=(Work("small", SCENE, LEVEL, RAMP, 0.0, {"rising": 1.0}),), strokes=2, per_stroke=40, steps=0)
-    rows = report["ramp"]
-    assert np.shape(report["ramp_maps"][0]["after"]) == SHAPE
-    assert [row["strokes_are"] for row in rows] == ["one depth", "a depth each", "rising"]
-    assert rows[2]["search_mm"] < rows[1]["search_mm"] < rows[0]["search_mm"] == rows[0]["before_mm"]
-    assert rows[2]["trial_mm"] == 1.0
