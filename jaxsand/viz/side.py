@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade, Bucket, NoTool, Tool, Wheel
+from jaxsand.scene.tools import Blade, Bucket, NoTool, Number, Tool, Wheel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,7 +89,7 @@ def draw_along(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: np
     if not isinstance(scene.tool, NoTool):
         axes.plot(far, 1e3 * z, ":", color="black", lw=1.0, label="the tool's bottom")
     for at in (0, -1):
-        outline = tool_outline(scene.tool)
+        outline = outline_along(scene.tool)
         axes.fill(far[at] + outline[:, 0], 1e3 * (z[at] + outline[:, 1]), color="0.3", alpha=0.35 if at else 0.15, lw=0)
     axes.set(xlabel="along the path (m)")
 
@@ -103,7 +103,7 @@ def draw_across(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: n
     far, points = _walked(path, spacing / 2)
     at = min(round(share * (len(far) - 1)), len(far) - 2)
     ahead = _ahead(points[at + 1] - points[at])
-    outline = tool_outline(scene.tool, across=True)
+    outline = outline_across(scene.tool)
     reach = max(2 * float(np.abs(outline[:, 0]).max(initial=0)), 8 * spacing)
     left = np.arange(-reach, reach + spacing / 4, spacing / 2)
     _profiles(axes, scene, maps, left, points[at] + left[:, None] * np.array([-ahead[1], ahead[0]]))
@@ -121,28 +121,49 @@ def section(height: np.ndarray, spacing: float, points: np.ndarray) -> np.ndarra
     return np.where((x >= 0) & (x <= columns) & (y >= 0) & (y <= rows), found, np.nan)
 
 
-def tool_outline(tool: Tool, *, across: bool = False) -> np.ndarray:
-    """The outline [n, 2] (m) of a tool from its side, or from behind (`across`): how far ahead (left), how far above its
-    lowest point. Nothing, [0, 2], for tools whose shape is not known.
+def outline_along(tool: Tool) -> np.ndarray:
+    """The outline [n, 2] (m) of a tool from its side: how far ahead, and how far above its lowest point.
+
+    Nothing, [0, 2], for tools whose shape is not known.
     """
     if isinstance(tool, Wheel):
-        radius, width, turn = float(tool.radius), float(tool.width), float(tool.slip_angle)
-        half = radius * abs(math.sin(turn)) + width / 2 * math.cos(turn) if across else 0.0
-        if not across and abs(math.sin(turn)) < 1e-9:
+        radius, turn = float(tool.radius), float(tool.slip_angle)
+        if abs(math.sin(turn)) < 1e-9:
             angle = np.linspace(0, 2 * math.pi, 49)
-            return np.stack([radius * np.sin(angle), radius * (1 - np.cos(angle))], axis=1)
-        half = half or radius * math.cos(turn) + width / 2 * abs(math.sin(turn))
+            return radius * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+        half = radius * math.cos(turn) + float(tool.width) / 2 * abs(math.sin(turn))
         return _box(-half, half, 2 * radius)
     if isinstance(tool, Blade):
-        ahead, wide = float(tool.thickness) / 2, float(tool.width) / 2
-        if tool.yaw is not None:
-            cos, sin = abs(math.cos(float(tool.yaw))), abs(math.sin(float(tool.yaw)))
-            ahead, wide = ahead * cos + wide * sin, wide * cos + ahead * sin
-        return _box(-wide, wide, wide) if across else _box(-ahead, ahead, float(tool.width) / 2)
+        half = _turned(float(tool.thickness) / 2, float(tool.width) / 2, tool.yaw)
+        return _box(-half, half, float(tool.width) / 2)
     if isinstance(tool, Bucket):
-        wide, length = float(tool.width) / 2, float(tool.length)
-        return _box(-wide, wide, wide) if across else _box(-length, 0.0, wide)
+        return _box(-float(tool.length), 0.0, float(tool.width) / 2)
     return np.zeros((0, 2))
+
+
+def outline_across(tool: Tool) -> np.ndarray:
+    """The outline [n, 2] (m) of a tool from behind: how far to the left, and how far above its lowest point.
+
+    Nothing, [0, 2], for tools whose shape is not known.
+    """
+    if isinstance(tool, Wheel):
+        radius, turn = float(tool.radius), float(tool.slip_angle)
+        half = radius * abs(math.sin(turn)) + float(tool.width) / 2 * math.cos(turn)
+        return _box(-half, half, 2 * radius)
+    if isinstance(tool, Blade):
+        half = _turned(float(tool.width) / 2, float(tool.thickness) / 2, tool.yaw)
+        return _box(-half, half, float(tool.width) / 2)
+    if isinstance(tool, Bucket):
+        half = float(tool.width) / 2
+        return _box(-half, half, half)
+    return np.zeros((0, 2))
+
+
+def _turned(this_way: float, other_way: float, yaw: Number | None) -> float:
+    """Half of a rectangle's extent along one of its sides, once it is turned."""
+    if yaw is None:
+        return this_way
+    return this_way * abs(math.cos(float(yaw))) + other_way * abs(math.sin(float(yaw)))
 
 
 def _box(start: float, stop: float, tall: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from PIL import Image
 
 import jaxsand as js
 from jaxsand.viz.loads import draw_bucket, save_bucket_animation
-from jaxsand.viz.side import section, side_figure, sides_figure, tool_outline
+from jaxsand.viz.side import outline_across, outline_along, section, side_figure, sides_figure
 
 X, Y = np.meshgrid((np.arange(30) + 0.5) * 0.01, (np.arange(20) + 0.5) * 0.01)
 PLANE = 0.1 * X - 0.2 * Y + 0.01
@@ -74,7 +74,7 @@ def test_the_tool_stands_at_its_bottom_height_where_it_is():
     ],
 )
 def test_outlines_are_as_long_and_as_wide_as_the_tool_and_stand_on_their_lowest_point(tool, long, wide):
-    from_the_side, from_behind = tool_outline(tool), tool_outline(tool, across=True)
+    from_the_side, from_behind = outline_along(tool), outline_across(tool)
     assert np.ptp(from_the_side[:, 0]) == pytest.approx(long)
     assert np.ptp(from_behind[:, 0]) == pytest.approx(wide)
     assert from_the_side[:, 1].min() == from_behind[:, 1].min() == 0
