@@ -42,7 +42,9 @@ if TYPE_CHECKING:
     from jaxsand.planning.gradient import optimise_strokes as optimise_strokes
     from jaxsand.planning.search import SandPlan as SandPlan
     from jaxsand.planning.search import plan_sand as plan_sand
+    from jaxsand.planning.search.actions import Flat as Flat
     from jaxsand.planning.search.actions import Lattice as Lattice
+    from jaxsand.planning.search.actions import Rising as Rising
     from jaxsand.planning.search.actions import Steps as Steps
     from jaxsand.relaxation.schemes import Multilevel as Multilevel
     from jaxsand.relaxation.schemes import Pairwise as Pairwise
@@ -100,6 +102,7 @@ _HOMES = {
     "DRY_SAND": "scene.material",
     "Deep": "scene.boundaries",
     "Draining": "scene.boundaries",
+    "Flat": "planning.search.actions",
     "Grid": "scene.grid",
     "Grousers": "scene.tools",
     "Lattice": "planning.search.actions",
@@ -119,6 +122,7 @@ _HOMES = {
     "PushRule": "interaction.rule",
     "Pushed": "interaction._path",
     "Relaxation": "relaxation.schemes",
+    "Rising": "planning.search.actions",
     "SandPlan": "planning.search",
     "Scene": "scene.scene",
     "Section": "terramechanics.sections",

@@ -40,7 +40,7 @@ LAYERS = (
     "scene",
     "autodiff",
 )
-NOT_REPORTS = ("map", "work_precision", "strokes_curves")  # long lists that are drawn and not read
+NOT_REPORTS = ("map", "work_precision", "strokes_curves", "ramp_maps")  # long lists that are drawn and not read
 
 
 def reference_pages() -> dict[str, str]:

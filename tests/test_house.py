@@ -8,8 +8,8 @@ import jaxsand
 PACKAGE = Path(jaxsand.__file__).parent
 
 HEAVY = {
-    "matplotlib": {"viz.render", "viz.trenches", "viz.strokes", "goals.surfaces"},
-    "PIL": {"viz.render", "goals.letters"},
+    "matplotlib": {"viz.render", "viz.trenches", "viz.strokes", "viz.side", "goals.surfaces"},
+    "PIL": {"viz.render", "viz.loads", "goals.letters"},
 }
 
 

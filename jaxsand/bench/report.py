@@ -26,6 +26,7 @@ from jaxsand.bench import (
     gradients,
     piles,
     pushes,
+    ramps,
     sand,
     stability,
     trenches,
@@ -62,7 +63,7 @@ def bench(
     **strokes: Any,
 ) -> dict[str, Any]:
     """The figures for `what`: settle, push, plan, or all of these; env, grad, calibrate, sand, strokes, trench,
-    stability, or letters.
+    stability, letters, or ramp.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
     `batch` is 4096, for env 1024, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`.
@@ -100,6 +101,8 @@ def bench(
     if what == "sand":
         report["children"] = sand.children_per_second()
         report["sand"] = sand.bench_sand(tell, seed=seed)
+    if what == "ramp":
+        report |= ramps.bench_ramps(tell, seed=seed)
     if what == "strokes":
         report |= strokebench.bench_strokes(tell, **strokes)
     if what == "calibrate":
@@ -205,7 +208,7 @@ def table(report: dict[str, Any]) -> str:
     """The report as text."""
     lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
     for what, rows in report.items():
-        if isinstance(rows, list) and rows and what not in ("map", "work_precision", "strokes_curves"):
+        if isinstance(rows, list) and rows and what not in ("map", "work_precision", "strokes_curves", "ramp_maps"):
             lines += ["", *as_table(rows, what.replace("_", " "))]
     return "\n".join(lines)
 

@@ -37,6 +37,12 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
             with written(out / "bench-trench.png") as path:
                 save_figure(lambda: spacing_figure(report["trench_by_spacing"]), path)
+        if "ramp_maps" in report:
+            from jaxsand.bench.ramps import shown as ramps_shown
+            from jaxsand.viz.side import sides_figure
+
+            with written(out / "bench-ramp.png") as path:
+                save_figure(lambda: sides_figure(ramps_shown(report["ramp_maps"])), path)
         if "strokes_curves" in report:
             from jaxsand.bench.strokes import REACHED, found
             from jaxsand.viz.strokes import found_figure, strokes_figure

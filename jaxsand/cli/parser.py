@@ -149,6 +149,7 @@ def _bench(commands: Any) -> None:
             "all",
             "stability",
             "letters",
+            "ramp",
         ],
         default="all",
     )

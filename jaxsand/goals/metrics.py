@@ -285,6 +285,52 @@ def fits(scene: Scene, goal: np.ndarray, name: str = "goal") -> None:
     finite(goal, name)
 
 
+def fits_where_it_counts(scene: Scene, goal: np.ndarray, name: str = "goal") -> None:
+    """Checks that a goal whose NaN cells are free has the scene's shape, and cells that count.
+
+    Args:
+      scene: the scene.
+      goal: [H, W] (m), NaN where any height will do.
+      name: of the goal, for the message.
+
+    Returns:
+      None.
+
+    Raises:
+      ValueError: if it has another shape, an infinite cell, or none that counts.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
+      >>> goal = np.full((4, 4), np.nan)
+      >>> goal[1, 1] = 0.0
+      >>> js.task.fits_where_it_counts(js.make_scene((4, 4), 0.01), goal)
+    """
+    if np.isnan(goal).all():
+        finite(goal, name)
+    fits(scene, np.where(np.isnan(goal), 0, goal), name)
+
+
+def still_to_do(height: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """The surplus of sand, height - goal, and 0 where the goal is free (NaN).
+
+    Args:
+      height: [..., H, W] (m).
+      goal: [H, W] (m), NaN where any height will do.
+
+    Returns:
+      [..., H, W] (m). A height that is not finite stays so.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
+      >>> js.task.still_to_do(np.array([[0.5, 0.5]]), np.array([[0.25, np.nan]])).tolist()
+      [[0.25, 0.0]]
+    """
+    goal = np.asarray(goal, float)
+    return np.where(np.isnan(goal), 0 * np.asarray(height, float), height - goal)
+
+
 def finite(goal: np.ndarray, name: str = "goal") -> None:
     """Checks that every cell of a goal is finite and none is masked.
 

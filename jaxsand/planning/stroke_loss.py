@@ -1,6 +1,7 @@
 """How far plans of strokes end from a goal, for many plans at once.
 
-A plan is an array [N, 4] of strokes x0, y0, x1, y1 (m). Every stroke that is pushed counts as one call of the simulator.
+A plan is an array [N, 4] of strokes x0, y0, x1, y1 (m), or [N, 6] of strokes x0, y0, z0, x1, y1, z1 (m), as of `step`.
+Every stroke that is pushed counts as one call of the simulator.
 """
 
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from typing import Protocol
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.goals.metrics import fits
+from jaxsand.goals.metrics import fits, fits_where_it_counts, still_to_do
 from jaxsand.interaction.batched import step_batch, value_and_grad_batch
 from jaxsand.scene.scene import Scene
 
@@ -58,7 +59,7 @@ class SandLoss:
     Args:
       scene: grid, sand and blade.
       start: the map [H, W] (m) before the first stroke, at rest.
-      goal: [H, W] (m).
+      goal: [H, W] (m), NaN where it is free.
     """
 
     scene: Scene
@@ -67,7 +68,7 @@ class SandLoss:
 
     def __post_init__(self) -> None:
         fits(self.scene, self.start, "start")
-        fits(self.scene, self.goal)
+        fits_where_it_counts(self.scene, self.goal)
 
     def __call__(self, candidates: np.ndarray) -> np.ndarray:
         """The losses [P] of plans [P, N, 4] (m)."""
@@ -100,7 +101,7 @@ class SandLoss:
         maps = [np.repeat(self.start[None].astype(np.float32), len(candidates), axis=0)]
         for k in range(candidates.shape[1]):
             maps.append(pushed(self.scene, maps[-1], candidates[:, k]))
-        value, back = weigh(maps[-1].astype(float) - self.goal)
+        value, back = weigh(still_to_do(maps[-1].astype(float), self.goal))
         out = np.zeros(candidates.shape)
         for k in reversed(range(candidates.shape[1])):
             back, out[:, k] = _pulled(self.scene, maps[k], candidates[:, k], back)
@@ -113,12 +114,26 @@ class SandLoss:
         high = np.array([columns - 1, rows - 1, columns - 1, rows - 1]) * float(self.scene.grid.spacing)
         return np.stack([np.zeros(4), high])
 
+    @property
+    def target(self) -> np.ndarray:
+        """The goal [H, W] (m), and the start's own height where the goal is free."""
+        return np.where(np.isnan(self.goal), self.start, self.goal)
+
+    def inside(self, plans: np.ndarray) -> np.ndarray:
+        """Plans [..., 4] or [..., 6] with every stroke moved onto the map; heights stay as they are."""
+        low, high = self.bounds
+        if plans.shape[-1] == 4:
+            return np.clip(plans, low, high)
+        free = np.full((2, 1), np.inf) * [[-1], [1]]
+        low, high = np.concatenate([self.bounds[:, :2], free, self.bounds[:, 2:], free], axis=1)
+        return np.clip(plans, low, high)
+
     def loss_of(self, height: np.ndarray) -> float:
         """The squared distance (m^2) of a map [H, W] (m) from the goal."""
         return float(self._loss(height))
 
     def _loss(self, maps: np.ndarray) -> np.ndarray:
-        square = ((maps.astype(float) - self.goal) ** 2).sum((-2, -1))
+        square = (still_to_do(maps.astype(float), self.goal) ** 2).sum((-2, -1))
         return np.where(np.isnan(square), np.inf, square)
 
 

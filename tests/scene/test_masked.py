@@ -46,9 +46,7 @@ OF_MASKED = {
     ),
     "map_pool": (lambda: map_pool([np.ma.masked_array([[True, True]], [[False, True]])]), f"maps: {OF_DIG}"),
     "goals": (lambda: js.make("multi-stroke", goals=MASKED[None]), "goals: got 1 cells that are not finite; fill them"),
-    "goal": (lambda: js.plan_sand(BLADED, LEVEL, MASKED), "goal: got 1 cells that are not finite; fill them"),
     "start": (lambda: js.optimise_strokes(BLADED, LEVEL, start=MASKED), "start: got 1 masked cells"),
-    "goal of gradients": (lambda: js.optimise_strokes(BLADED, MASKED), "goal: got 1 cells that are not finite; fill them"),
     "before": (lambda: js.calibrate(BLADED, js.Trial(MASKED, LEVEL)), "before: got 1 masked cells"),
     "regions": (
         lambda: js.calibrate(BLADED, js.Trial(LEVEL, LEVEL), regions=MASKED.astype(int)),

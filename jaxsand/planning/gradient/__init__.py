@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.interaction.simulate import STROKES
 from jaxsand.planning.gradient import moves
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses
 from jaxsand.planning.no_strokes import why_no_strokes
-from jaxsand.planning.stroke_loss import Best, SandLoss, pushed
+from jaxsand.planning.stroke_loss import GRADIENT, Best, SandLoss, pushed
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.masked import POINTS, gaps
 from jaxsand.scene.progress import Tell, quiet
@@ -33,7 +34,8 @@ class Optimised:
     """What `optimise_strokes` found.
 
     Attributes:
-      strokes: the best plan [N, 4] = x0, y0, x1, y1 (m), in order; N is 0 if nothing was found or nothing is to change.
+      strokes: the best plan [N, 4] = x0, y0, x1, y1 (m), in order, or [N, 6] = x0, y0, z0, x1, y1, z1 (m) from a guess with
+        heights; N is 0 if nothing was found or nothing is to change.
       losses: sum (h - goal)^2 (m^2) of the start, then of every better plan found on the way [K]; the last is that of
         `strokes`.
       calls: after how many calls of the simulator each of `losses` was found [K].
@@ -103,15 +105,17 @@ def optimise_strokes(
 
     Args:
       scene: grid, sand and a `Blade`.
-      goal: heights [H, W] (m), `goal[i, j]` at x = (j + 1/2) dx, y = (i + 1/2) dx.
+      goal: heights [H, W] (m), `goal[i, j]` at x = (j + 1/2) dx, y = (i + 1/2) dx; cells that are NaN or masked are free:
+        the sand there may have any height, and the loss leaves them out.
       strokes: how many pushes; None lets the optimiser choose as many as pay, up to `most`.
       key: a JAX key or a whole number; the same key finds the same plan on the same machine.
       start: the map [H, W] (m) before the first push, at rest; None stands for level sand at 0.
       budget: how many calls of the simulator may be made; a push of one stroke is one call, its gradient four more.
       most: the largest number of pushes if `strokes` is None.
       smoothing: blurs the maps for the first steps; None does not.
-      guess: a plan [N, 4] (m) to start from, such as a policy's, with N = `strokes` if that is given; None starts from a
-        sketch.
+      guess: a plan [N, 4] or, with heights, [N, 6] (m) to start from, such as a policy's or `plan_sand(...).strokes`, with
+        N = `strokes` if that is given; None starts from a sketch. A guess with heights keeps its order, and is moved by
+        gradients alone.
       tell: is called with a line of progress.
 
     Returns:
@@ -153,8 +157,15 @@ def optimise_strokes(
     if account.before > 0 and plan is None:
         search(account, strokes, rng, most, smoothing)
     elif account.before > 0 and plan is not None and len(plan):
-        improve(account, print_of(account), moves.Plans(plan[None], account.losses(plan[None])), rng, smoothing)
-    steps = [Best(0, account.before, np.zeros((0, 4))), *(best for best in account.history if best.loss < account.before)]
+        if plan.shape[1] == 6:
+            downhill(account, moves.Plans(plan[None], account.losses(plan[None])))
+        else:
+            improve(account, print_of(account), moves.Plans(plan[None], account.losses(plan[None])), rng, smoothing)
+    numbers = 4 if plan is None else plan.shape[1]
+    steps = [
+        Best(0, account.before, np.zeros((0, numbers))),
+        *(best for best in account.history if best.loss < account.before),
+    ]
     found = steps[-1].strokes
     height = sand.maps(found[None])[0]
     losses, calls = np.array([s.loss for s in steps]), np.array([s.calls for s in steps])
@@ -185,7 +196,7 @@ def as_many_as_pay(account: Account, mark: Print, most: int, rng: np.random.Gene
     """The fewest strokes with which the sketch comes nearly as close as with any number up to `most`; calls no simulator."""
     sand, far = account.sand, list[float]()
     for n in range(1, most + 1):
-        far.append(guesses(mark, sand.start, sand.goal, n, rng)[1][0])
+        far.append(guesses(mark, sand.start, sand.target, n, rng)[1][0])
         if n > 2 and min(far[-2:]) > min(far):  # the prints of more only get in each other's way
             break
     return 1 + next(n for n, left in enumerate(far) if left <= _NEARLY * min(far))
@@ -207,8 +218,8 @@ def print_of(account: Account) -> Print:
 def first(account: Account, mark: Print, strokes: int, rng: np.random.Generator) -> moves.Plans | None:
     """Plans from the sketch, closest first; None if the budget is spent."""
     dx = float(account.sand.scene.grid.spacing)
-    plans = guesses(mark, account.sand.start, account.sand.goal, strokes, rng)[0] * dx
-    plans = np.clip(plans, *account.sand.bounds)
+    plans = guesses(mark, account.sand.start, account.sand.target, strokes, rng)[0] * dx
+    plans = account.sand.inside(plans)
     plans = plans[: max(1, min(len(plans), account.room(strokes) // 4))]
     losses = account.losses(plans)
     return moves.ranked(plans, losses, _LANES) if np.isfinite(losses).any() else None
@@ -232,17 +243,31 @@ def improve(account: Account, mark: Print, plans: moves.Plans, rng: np.random.Ge
         plans = moves.quasi_newton(account, plans.part(slice(1)), 4).joined(plans.part(slice(1, None)))
         if plans.losses[0] > 0.98 * last:  # stuck: from beside the best plan
             near = plans.strokes[:1] + rng.normal(0, 0.7 * dx, (_LANES - 1, *plans.strokes.shape[1:]))
-            near = np.clip(near, *account.sand.bounds)
+            near = account.sand.inside(near)
             plans = plans.part(slice(1)).joined(moves.Plans(near, account.losses(near)))
         if account.calls == spent:
             break
 
 
+def downhill(account: Account, plans: moves.Plans) -> None:
+    """Moves plans by gradients alone, in turns of Adam, for two thirds of what is left of the budget, and of L-BFGS.
+
+    Each turn begins with steps half as long as the last one's, and they end where a turn no longer helps.
+    """
+    size, last = 0.15 * float(account.sand.scene.grid.spacing), math.inf
+    while account.history and account.afford(plans.strokes) and plans.losses[0] < last:
+        last, steps = float(plans.losses[0]), account.room(plans.strokes.shape[1]) // (1 + GRADIENT)
+        plans = moves.adam(account, plans, max(1, 2 * steps // 3), size)
+        plans = moves.quasi_newton(account, plans, steps)
+        size /= 2
+
+
 def _plan(guess: jax.typing.ArrayLike, strokes: int | None) -> np.ndarray:
-    """A user's guess as an array [N, 4]."""
+    """A user's guess as an array [N, 4] or [N, 6]."""
     plan = np.asarray(as_array("guess", guess, masked=POINTS), float)
-    if plan.ndim != 2 or plan.shape[1] != 4 or strokes not in (None, len(plan)) or not np.isfinite(plan).all():
-        raise ValueError(f"guess: got shape {list(plan.shape)}; give [{strokes or 'N'}, 4], finite x0, y0, x1, y1 in metres")
+    if plan.ndim != 2 or plan.shape[1] not in STROKES or strokes not in (None, len(plan)) or not np.isfinite(plan).all():
+        shapes = f"[{strokes or 'N'}, 4], finite x0, y0, x1, y1 in metres, or [{strokes or 'N'}, 6] with heights"
+        raise ValueError(f"guess: got shape {list(plan.shape)}; give {shapes}")
     return plan
 
 

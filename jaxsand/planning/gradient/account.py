@@ -44,7 +44,7 @@ class Account:
         return out
 
     def gradient(self, plans: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
-        """The losses [P] of plans [P, N, 4], and the gradients [P, N, 4] of the losses of maps blurred by `blur` cells."""
+        """The losses [P] of plans [P, N, 4] or [P, N, 6], and the gradients of those of maps blurred by `blur` cells."""
         self.calls += len(plans) * plans.shape[1] * (1 + GRADIENT)
         sharp: list[np.ndarray] = []
 

@@ -11,9 +11,11 @@ import jax
 import numpy as np
 import optax
 
+from jaxsand.goals.metrics import still_to_do
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses, swaps
 
+_HEIGHTS = 0.3  # as long as steps along the ground are steps in a stroke's heights
 _STEPS = (1.0, 0.3, 0.1, 0.03)  # lengths that a quasi-Newton step is tried at
 _MEMORY = 8  # gradients that the quasi-Newton steps remember
 _DRAWN = 32  # strokes that are tried at a time
@@ -22,7 +24,7 @@ _TRIED = 3  # strokes that are tried in the place of one
 
 @dataclass(frozen=True)
 class Plans:
-    """Plans of equally many strokes, `strokes` [P, N, 4] (m), and their `losses` [P] (m^2)."""
+    """Plans of equally many strokes, `strokes` [P, N, 4] or [P, N, 6] (m), and their `losses` [P] (m^2)."""
 
     strokes: np.ndarray
     losses: np.ndarray
@@ -48,19 +50,19 @@ def ranked(plans: np.ndarray, losses: np.ndarray, most: int) -> Plans:
 
 
 def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 0.0) -> Plans:
-    """Follows the gradient by Adam; its first step is `size` (m) long, its last a tenth of that."""
+    """Follows the gradient by Adam; its first step is `size` (m) long, its last a tenth of that, in heights less."""
     plans, losses = start.strokes.copy(), start.losses.copy()
     rule = optax.adam(optax.cosine_decay_schedule(size, max(steps, 1), 0.1), b2=0.95)
     here: Any = plans.copy()
-    state = rule.init(here)
+    state, units = rule.init(here), _units(here)
     for _ in range(steps):
         if not account.afford(here):
             break
         now, slope = account.gradient(here, blur)
         better = now < losses
         plans[better], losses[better] = here[better], now[better]
-        update, state = rule.update(np.nan_to_num(slope) / account.before, state)
-        here = _inside(account, here + np.asarray(update))
+        update, state = rule.update(np.nan_to_num(slope) * units / account.before, state)
+        here = account.sand.inside(here + np.asarray(update) * units)
     return ranked(plans, losses, len(plans))
 
 
@@ -68,7 +70,7 @@ def quasi_newton(account: Account, start: Plans, steps: int) -> Plans:
     """Follows the gradient by L-BFGS, every plan for itself; of four step lengths the best is taken."""
     plans, losses = start.strokes.copy(), start.losses.copy()
     rule = optax.scale_by_lbfgs(_MEMORY)
-    scale = 1e-3  # metres to about the size that gradients change over
+    scale = 1e-3 * _units(plans)  # metres to about the size that gradients change over
     state = jax.vmap(rule.init)(plans / scale)
     for _ in range(steps):
         if not account.afford(plans):
@@ -79,7 +81,7 @@ def quasi_newton(account: Account, start: Plans, steps: int) -> Plans:
         way = -np.asarray(way) * scale
         longest = np.abs(way).max((1, 2), keepdims=True)
         way *= np.minimum(1, 5e-3 / np.maximum(longest, 1e-12))
-        tried = _inside(account, plans[:, None] + way[:, None] * np.array(_STEPS)[None, :, None, None])
+        tried = account.sand.inside(plans[:, None] + way[:, None] * np.array(_STEPS)[None, :, None, None])
         far = account.losses(tried.reshape(-1, *plans.shape[1:])).reshape(len(plans), -1)
         which = np.argmin(far, axis=1)
         lane = np.arange(len(plans))
@@ -121,7 +123,7 @@ def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generat
         left = account.maps(rest[None])[0] if n > 1 else account.sand.start
         if np.isnan(left).any():
             continue
-        new = _inside(account, guesses(mark, left, account.sand.goal, 1, rng)[0][:_TRIED, 0] * dx)
+        new = account.sand.inside(guesses(mark, left, account.sand.target, 1, rng)[0][:_TRIED, 0] * dx)
         others += [np.insert(rest, place, stroke, axis=0) for stroke in new for place in {0, k, n - 1}]
     if not others:
         return start
@@ -143,12 +145,12 @@ def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.
         rounds = max(1, calls // strokes // _DRAWN)
         for k in range(rounds):
             if k < max(1, rounds // 3):
-                drawn = _from_high_to_low(here.astype(float) - sand.goal, rng) * dx
+                drawn = _from_high_to_low(still_to_do(here, sand.goal), rng) * dx
                 anywhere = rng.random((_DRAWN, 4)) * (high - low) + low
                 drawn = np.where(rng.random((_DRAWN, 1)) < 0.5, drawn, anywhere)
             else:
                 drawn = best + rng.normal(0, 1, (_DRAWN, 4)) * np.geomspace(0.3, 6, _DRAWN)[:, None] * dx
-            drawn = _inside(account, drawn)[: account.room(1)]
+            drawn = sand.inside(drawn)[: account.room(1)]
             if not len(drawn):
                 break
             far, maps = account.after(here, drawn)
@@ -171,7 +173,6 @@ def _from_high_to_low(off: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack(ends, 1) + 0.5
 
 
-def _inside(account: Account, plans: np.ndarray) -> np.ndarray:
-    """The plans with every stroke moved onto the map."""
-    low, high = account.sand.bounds
-    return np.clip(plans, low, high)
+def _units(plans: np.ndarray) -> np.ndarray:
+    """How long a step in each of a stroke's numbers is, next to one along the ground."""
+    return np.array([1, 1, _HEIGHTS] * 2) if plans.shape[-1] == 6 else np.ones(plans.shape[-1])

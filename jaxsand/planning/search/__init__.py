@@ -1,5 +1,6 @@
 """Planning on real sand: a search in which every child is a height map that the simulator made."""
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -7,9 +8,10 @@ import numpy as np
 
 from jaxsand.goals import metrics
 from jaxsand.planning.no_strokes import why_no_strokes
-from jaxsand.planning.search.actions import Actions, Job, Lattice, Path, Steps, longest_stroke
+from jaxsand.planning.search.actions import Actions, Flat, Job, Lattice, Path, Rising, Steps, longest_stroke
 from jaxsand.planning.search.binary import binary_hints, binary_paths
-from jaxsand.planning.search.reach import blade_size, least_distance
+from jaxsand.planning.search.heights import search_heights
+from jaxsand.planning.search.reach import blade_size, least_distance, volume_distance
 from jaxsand.planning.search.rollouts import Effort, distance, replay
 from jaxsand.planning.search.steps import search_steps
 from jaxsand.planning.search.strokes import search_strokes
@@ -24,16 +26,19 @@ class SandPlan:
     """What `plan_sand` found.
 
     Attributes:
-      paths: points [n, 2] = x, y (m) of each path, in order; the tool is lifted between paths.
+      paths: points [n, 2] = x, y (m) of each path, or [n, 3] = x, y, z (m) with `Rising` or `Flat`, in order; the tool is
+        lifted between paths.
       height: the map [H, W] (m) that `follow` makes of the paths, one after the other.
-      before: l2 distance (m) of the start from the goal, sqrt(sum (h - goal)^2).
+      before: l2 distance (m) of the start from the goal, sqrt(sum (h - goal)^2) over the cells that are not free.
       after: l2 distance (m) of `height` from the goal.
-      lower_bound: proven: no plan of as many strokes as were allowed, however placed, comes closer than this (m).
+      lower_bound: proven: no plan of as many strokes as were allowed, however placed, comes closer than this (m). With
+        heights of their own it is what the mean height alone allows.
       estimate: a guess (m) of what could be reached: what is left if every stroke gains as much as the best of all that were
         tried.
       effort: how many pushes were simulated in full, and how many roughly (see `plan_sand`).
       reason: why there are no paths, and what to do; None where there are some.
-      strokes: every stroke or leg [n, 4] = x0, y0, x1, y1 (m), in order.
+      strokes: every stroke or leg [n, 4] = x0, y0, x1, y1 (m), or [n, 6] = x0, y0, z0, x1, y1, z1 (m) with heights, in
+        order.
       gap: after - lower_bound (m).
       reduction: 1 - after / before; 0 where there was nothing to gain.
 
@@ -67,8 +72,9 @@ class SandPlan:
 
     @property
     def strokes(self) -> np.ndarray:
-        """Every stroke or leg as x0, y0, x1, y1 (m), in order: [n, 4]."""
-        return np.array([[*a, *b] for path in self.paths for a, b in pairwise(path)]).reshape(-1, 4)
+        """Every stroke or leg as x0, y0, x1, y1 (m) [n, 4], or with heights [n, 6], in order."""
+        numbers = 2 * self.paths[0].shape[1] if self.paths else 4
+        return np.array([[*a, *b] for path in self.paths for a, b in pairwise(path)]).reshape(-1, numbers)
 
 
 def plan_sand(
@@ -88,13 +94,16 @@ def plan_sand(
     of the binary plan (`plan`, on blocks as wide as the blade) are among the children, and the best plans' strokes are then
     varied one at a time. With `Steps`, the binary plan's walk over one piece of what is to dig is among the paths.
 
+    With `Rising` or `Flat` it is greedy: each stroke is the best of many on the sand before it, and the plan's strokes are
+    then varied one at a time. `optimise_strokes(guess=plan.strokes)` goes on from there by gradients.
+
     Args:
       scene: grid, sand and a `Blade`.
       height: the map [H, W] (m) to start from, at rest; `height[i, j]` is at x = (j + 1/2) dx, y = (i + 1/2) dx.
-      goal: [H, W] (m).
+      goal: [H, W] (m); cells that are NaN or masked are free: the sand there may have any height.
       strokes: the largest number of strokes, or of legs.
       actions: `Lattice()` for strokes with the tool lifted in between (the default), `Steps()` for one path with the tool
-        down.
+        down, `Rising()` for strokes on which the tool rises or sinks, `Flat()` for strokes with a height each.
       budget: how many full pushes the search may cost at most; a rough push (`SwathPush()`, 8 sweeps) counts as 1/12. With
         too few for what it does at each stroke, it tries fewer strokes, or none.
       seed: equal seeds give equal plans.
@@ -130,7 +139,10 @@ def plan_sand(
     left = float(distance(after, goal))
     if left > before:  # `follow` leaves slightly other maps than the search's own pushes
         paths, after, left = [], height, before
-    bound = least_distance(scene, height, goal, strokes, longest_stroke(scene, actions))
+    if isinstance(actions, Rising | Flat):
+        bound = volume_distance(scene, height, goal)
+    else:
+        bound = least_distance(scene, height, goal, strokes, longest_stroke(scene, actions))
     estimate = max(0.0, before - strokes * effort.gain)
     reason = None if paths else why_no_strokes(scene, height, goal)
     return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason)
@@ -140,6 +152,8 @@ def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Pat
     if isinstance(job.actions, Steps):
         walks = binary_paths(job.scene, job.height, job.goal, job.actions)
         return search_steps(job, walks[0] if walks else np.zeros((0, 2), int), budget, rng)
+    if isinstance(job.actions, Rising | Flat):
+        return search_heights(job, budget, rng)
     return search_strokes(job, binary_hints(job), budget, rng)
 
 
@@ -148,7 +162,7 @@ def _checked(scene: Scene, height: np.ndarray, goal: np.ndarray) -> tuple[np.nda
     blade_size(scene)
     height = np.asarray(fit(scene, as_array("height", height, np.float32))[1])
     goal = np.asarray(gaps(goal), float)
-    metrics.fits(scene, goal)
+    metrics.fits_where_it_counts(scene, goal)
     metrics.finite(height, "height")
     slope, mu = float(steepest_slope(scene, height)), np.tan(np.asarray(scene.material.repose_angle, float))
     if slope > np.max(mu) + 2e-3:
@@ -169,6 +183,18 @@ def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, se
                 f"actions.longest: got {actions.longest!r} with shortest {actions.shortest!r} and pitch {actions.pitch!r}; "
                 f"give spacings with pitch and shortest at most longest, and at most {largest}"
             )
+    elif isinstance(actions, Rising | Flat):
+        across = math.hypot(*scene.grid.shape)
+        if not 0 < actions.shortest <= min(actions.longest, across):
+            raise ValueError(
+                f"actions.shortest: got {actions.shortest!r} with longest {actions.longest!r}; "
+                f"give spacings, above 0, at most longest, and at most {across:.4g}"
+            )
+        if not actions.lowest <= actions.highest:
+            raise ValueError(
+                f"actions.lowest: got {actions.lowest!r} with highest {actions.highest!r}; "
+                "give heights in metres, at most highest"
+            )
     elif isinstance(actions, Steps):
         check_whole("actions.cell", actions.cell, 1)
         check_whole("actions.margin", actions.margin, 0)
@@ -178,4 +204,4 @@ def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, se
                 "fewer than two steps; give a smaller one"
             )
     else:
-        raise ValueError(f"actions: got {actions!r}; give Lattice(pitch, shortest, longest) or Steps(cell, margin)")
+        raise ValueError(f"actions: got {actions!r}; give Lattice(), Steps(), Rising() or Flat()")

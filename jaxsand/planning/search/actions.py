@@ -1,4 +1,6 @@
-"""What a planner on real sand may do: strokes with the tool lifted in between, or steps with the tool down."""
+"""What a planner on real sand may do: strokes with the tool lifted in between, at the blade's depth or at heights of their
+own, or steps with the tool down.
+"""
 
 import math
 from dataclasses import dataclass
@@ -6,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxsand.goals.metrics import still_to_do
 from jaxsand.scene.scene import Scene
 
-Path = np.ndarray  # [n, 2]: x, y (m)
+Path = np.ndarray  # [n, 2]: x, y (m), or [n, 3]: x, y, z (m)
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,63 @@ class Steps:
     margin: int = 0
 
 
-Actions = Lattice | Steps
+@dataclass(frozen=True)
+class Rising:
+    """Tells `plan_sand` to use straight strokes on which the tool may rise or sink, lifted in between.
+
+    A stroke has the heights of the tool's bottom at its start and at its end, in place of the blade's own depth.
+
+    Args:
+      shortest: the shortest stroke that is made, in grid spacings.
+      longest: the longest stroke that is made, in grid spacings.
+      lowest: the least height that the tool's bottom may have (m).
+      highest: the greatest height that it may have (m).
+
+    Example:
+      >>> import jaxsand as js
+      >>> js.Rising(lowest=-0.02).highest
+      inf
+    """
+
+    shortest: float = 2.0
+    longest: float = math.inf
+    lowest: float = -math.inf
+    highest: float = math.inf
+
+    def allowed(self, heights: np.ndarray) -> np.ndarray:
+        """Heights [n, 2] (m) at the ends of strokes, within the bounds."""
+        return np.clip(heights, self.lowest, self.highest)
+
+
+@dataclass(frozen=True)
+class Flat:
+    """Tells `plan_sand` to use straight strokes, each at one height of its own, the tool lifted in between.
+
+    With `lowest` equal to `highest`, all strokes are at that height.
+
+    Args:
+      shortest: the shortest stroke that is made, in grid spacings.
+      longest: the longest stroke that is made, in grid spacings.
+      lowest: the least height that the tool's bottom may have (m).
+      highest: the greatest height that it may have (m).
+
+    Example:
+      >>> import jaxsand as js
+      >>> js.Flat(lowest=-0.01, highest=-0.01).shortest
+      2.0
+    """
+
+    shortest: float = 2.0
+    longest: float = math.inf
+    lowest: float = -math.inf
+    highest: float = math.inf
+
+    def allowed(self, heights: np.ndarray) -> np.ndarray:
+        """Heights [n, 2] (m) at the ends of strokes, both the start's, within the bounds."""
+        return np.clip(np.repeat(heights[:, :1], 2, axis=1), self.lowest, self.highest)
+
+
+Actions = Lattice | Steps | Rising | Flat
 
 
 @dataclass(frozen=True)
@@ -63,7 +122,7 @@ class Job:
     Attributes:
       scene: grid, sand and blade.
       height: the map [H, W] (m) to start from, at rest.
-      goal: [H, W] (m).
+      goal: [H, W] (m), NaN where it is free.
       strokes: the largest number of strokes or legs.
       actions: their kind.
     """
@@ -94,9 +153,9 @@ def propose(
     spacing = float(scene.grid.spacing)
     points = _lattice(scene, actions)
     rows, columns = np.floor(points[:, ::-1] / spacing).astype(int).T
-    surplus = _blurred(height - goal)[rows, columns]
+    surplus = _blurred(still_to_do(height, goal))[rows, columns]
     anywhere = np.full(len(points), 1 / len(points))
-    much, little = _shares(surplus, anywhere), _shares(-surplus, anywhere)
+    much, little = shares(surplus, anywhere), shares(-surplus, anywhere)
     longest = longest_stroke(scene, actions) * (1 + 1e-9)
     found = np.zeros((0, 4))
     while len(found) < count:
@@ -153,7 +212,7 @@ def _lattice(scene: Scene, actions: Lattice) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def _shares(amount: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+def shares(amount: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     """Positive amounts as shares that sum to 1; `otherwise` where none is positive."""
     amount = np.maximum(amount, 0)
     return amount / amount.sum() if amount.sum() > 0 else otherwise

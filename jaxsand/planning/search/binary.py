@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from jaxsand.goals.metrics import still_to_do
 from jaxsand.planning.binary import connected_pieces, plan
 from jaxsand.planning.search.actions import Job, Steps, corners, longest_stroke
 from jaxsand.planning.search.reach import blade_size
@@ -25,7 +26,7 @@ def binary_paths(
     """
     rows, columns = corners(scene, steps, offset).shape[:2]
     top, left = (steps.margin + o for o in offset)
-    surplus = (height - goal)[top : top + rows * steps.cell, left : left + columns * steps.cell]
+    surplus = still_to_do(height, goal)[top : top + rows * steps.cell, left : left + columns * steps.cell]
     blocks = surplus.reshape(rows, steps.cell, columns, steps.cell).mean((1, 3))
     deepest = max(blade_size(scene)[2], float(surplus.max()))
     dig = np.flipud(blocks > part * deepest)

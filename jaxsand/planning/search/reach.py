@@ -22,6 +22,7 @@ import math
 
 import numpy as np
 
+from jaxsand.goals.metrics import still_to_do
 from jaxsand.scene.boundaries import Closed
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, square
@@ -35,23 +36,33 @@ def least_distance(scene: Scene, height: np.ndarray, goal: np.ndarray, strokes: 
 
         min |h + v - g|_2   with   sum v-  <=  n A,   sum v+  <=  n A,   v-  <=  (h + d)+,
 
-    which cuts surplus and lack off at one level each. Where no sand drains, the distance is also at least that of the
+    which cuts surplus and lack off at one level each. Free cells of the goal have neither. Where no sand drains and no cell
+    is free, the distance is also at least that of the
     mean heights, over all cells. For isotropic sand, whose A is not proven, only the latter is used.
 
     Args:
       scene: grid, sand and blade.
-      height, goal: maps [H, W] (m).
+      height, goal: maps [H, W] (m); the goal is NaN where it is free.
       strokes: n.
       longest: the longest stroke allowed (m).
     """
-    surplus = np.asarray(height, float) - np.asarray(goal, float)
-    uneven = abs(surplus.sum()) / math.sqrt(surplus.size) if isinstance(scene.edge, Closed) else 0.0
+    surplus, uneven = still_to_do(height, goal), volume_distance(scene, height, goal)
     if scene.grid.neighbours == "isotropic":
-        return float(uneven)
+        return uneven
     amount = strokes * most_lowered(scene, height, longest)
     above = np.maximum(np.asarray(height, float) + blade_size(scene)[2], 0)
     left = _cut_off(np.maximum(surplus, 0), above, amount) ** 2 + _cut_off(np.maximum(-surplus, 0), np.inf, amount) ** 2
-    return max(float(uneven), math.sqrt(left.sum()))
+    return max(uneven, math.sqrt(left.sum()))
+
+
+def volume_distance(scene: Scene, height: np.ndarray, goal: np.ndarray) -> float:
+    """The l2 distance (m) that is left however the sand is moved: that of the mean heights, over all cells.
+
+    It is 0 where sand drains, or where a cell of the goal is free.
+    """
+    if not isinstance(scene.edge, Closed) or np.isnan(goal).any():
+        return 0.0
+    return float(abs(still_to_do(height, goal).sum()) / math.sqrt(np.size(goal)))
 
 
 def most_lowered(scene: Scene, height: np.ndarray, longest: float) -> float:

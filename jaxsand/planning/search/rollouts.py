@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxsand.goals.metrics import still_to_do
 from jaxsand.interaction.batched import act_batch, step_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.outcome import check
@@ -41,13 +42,14 @@ class Effort:
 
 
 def distance(maps: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """The l2 distance (m) of maps [..., H, W] from the goal; infinite for a map that is not finite."""
-    square = ((np.asarray(maps, float) - goal) ** 2).sum((-2, -1))
+    """The l2 distance (m) of maps [..., H, W] from the goal, where it counts; infinite for a map that is not finite."""
+    square = (still_to_do(np.asarray(maps, float), goal) ** 2).sum((-2, -1))
     return np.where(np.isnan(square), np.inf, np.sqrt(square))
 
 
 def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
-    """The maps [n, H, W] (m) after one stroke [n, 4] (m) on each of `maps` [n, H, W]; NaN where an outcome is not clean.
+    """The maps [n, H, W] (m) after one stroke [n, 4] or [n, 6] (m) on each of `maps` [n, H, W]; NaN where an outcome is not
+    clean.
 
     Raises:
       OutcomeError: if no outcome of the batch is clean.
