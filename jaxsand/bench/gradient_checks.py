@@ -1,7 +1,7 @@
 """How right gradients are: by height, stroke and angle of repose, against differences at random points."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -9,16 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.interaction.bucket import dump, load_volume, scoop
 from jaxsand.interaction.simulate import act, step
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import Stop, Sweeps
+from jaxsand.scene.boundaries import Base, Deep
 from jaxsand.scene.grid import Neighbours
-from jaxsand.scene.scene import cast, make_scene
-from jaxsand.scene.tools import Blade
+from jaxsand.scene.scene import Scene, cast, make_scene
+from jaxsand.scene.tools import Blade, Bucket, Tool, Wheel
 from jaxsand.scene.window import Window
 
 Inputs = tuple[Any, Any, Any]
-"""Heights [B, H, W] (m), strokes [B, 4] (m) and angles of repose [B] (rad)."""
+"""Heights [B, H, W] (m), strokes [B, 4] or [B, 6] (m) and angles of repose [B] (rad)."""
 
 SPACING = 0.01
 STEPS = (1e-4, 1e-5, 1e-6, 1e-7)
@@ -31,21 +33,40 @@ _UNITS = (SPACING, SPACING, 1.0)
 
 @dataclass(frozen=True)
 class Case:
-    """A program whose gradient is wanted: settling, or a push and settling."""
+    """A program whose gradient is wanted: settling, or a push by a tool and settling; of a bucket, a scoop and a dump.
+
+    `rises`: strokes have heights. `base`: what lies under the sand.
+    """
 
     pushes: bool
     neighbours: Neighbours = 8
     window: Window | None = None
     stop: Stop | None = None
+    tool: Tool = field(default_factory=Blade)
+    rises: bool = False
+    base: Deep | Base = field(default_factory=Deep)
 
     @property
     def name(self) -> str:
-        parts = ["push and settle" if self.pushes else "settle", f"{self.neighbours}"]
+        parts = [self._work(), f"{self.neighbours}"]
         if self.window:
             parts.append("window {} x {}".format(*self.window.size))
         if isinstance(self.stop, Sweeps):
             parts.append(f"{self.stop.count} sweeps")
+        if isinstance(self.base, Base):
+            parts.append("on a floor")
         return ", ".join(parts)
+
+    def _work(self) -> str:
+        if not self.pushes:
+            return "settle"
+        if isinstance(self.tool, Bucket):
+            return "scoop and dump"
+        way = "rise and settle" if self.rises else "push and settle"
+        if isinstance(self.tool, Wheel):
+            return f"{way}, wheel"
+        yaw, plates = (getattr(self.tool, name, None) for name in ("yaw", "plates"))
+        return way + (", at an angle" if yaw is not None else "") + (", plates" if plates is not None else "")
 
 
 def program(case: Case, cells: int) -> Callable[..., Any]:
@@ -56,13 +77,23 @@ def program(case: Case, cells: int) -> Callable[..., Any]:
     def run(height: Any, stroke: Any, angle: Any, stop: Stop | None = case.stop) -> tuple[Any, Any]:
         of: Any = {"neighbours": case.neighbours}
         if case.pushes:
-            scene = make_scene((cells, cells), SPACING, angle, tool=Blade(), window=case.window, **of)
-            after: Any = step(scene, height, stroke, stop=stop)
+            scene = make_scene((cells, cells), SPACING, angle, tool=case.tool, window=case.window, base=case.base, **of)
+            after: Any = _worked(scene, height, stroke, stop)
         else:
             after = settle(make_scene((cells, cells), SPACING, angle, **of), height, stop=stop, window=case.window)
         return jnp.sum(jnp.asarray(weights, after.height.dtype) * after.height), after.sweeps
 
     return run
+
+
+def _worked(scene: Scene, height: Any, stroke: Any, stop: Stop | None) -> Any:
+    """A push; of a bucket a scoop, and a dump of 0.6 of what it took up where the scoop ended."""
+    if not isinstance(scene.tool, Bucket):
+        return step(scene, height, stroke, stop=stop)
+    path = stroke.reshape(2, -1)
+    scooped = scoop(scene, height, path, stop=stop)
+    amount = 0.6 * load_volume(scene, scooped.load)
+    return dump(scene, scooped.height, path[1:], scooped.load, amount=amount, stop=stop)
 
 
 def differentiated(run: Callable[..., Any]) -> Callable[..., Any]:
@@ -84,6 +115,9 @@ def inputs(case: Case, cells: int, batch: int, seed: int = 0) -> Inputs:
     size, phase = rng.uniform(-2e-3, 2e-3, (4, batch, 1, 1)), rng.uniform(0, 6, (4, batch, 1, 1))
     heights = (size * np.sin(slow * x + fast * y + phase)).sum(0)
     strokes = cells * SPACING / 2 + rng.uniform(-0.1, 0.1, (batch, 4))
+    if case.rises:
+        ends, z = np.split(strokes, 2, axis=1), rng.uniform(-0.012, 0.0, (2, batch, 1))
+        strokes = np.concatenate([ends[0], z[0], ends[1], z[1]], 1)
     angles = np.radians(rng.uniform(27, 31, batch))
     if not case.pushes:
         heights = _pushed(heights, strokes, angles)

@@ -26,9 +26,10 @@ from jaxsand.bench.timing import race
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
 from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
+from jaxsand.scene.boundaries import Base
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import cast, make_scene
-from jaxsand.scene.tools import Blade
+from jaxsand.scene.tools import Blade, Bucket, Wheel
 from jaxsand.scene.window import Window
 
 Row = dict[str, Any]
@@ -40,6 +41,17 @@ CASES = (
     *(Case(pushes, window=Window((16, 16))) for pushes in (False, True)),
     Case(False, stop=Sweeps(1000)),
 )
+TOOLS = (
+    Case(True),
+    Case(True, rises=True),
+    Case(True, tool=Blade(yaw=0.5)),
+    Case(True, tool=Blade(plates=0.03)),
+    Case(True, tool=Wheel(0.04, 0.03, 0.01)),
+    Case(True, tool=Wheel(0.04, 0.03, 0.01), rises=True),
+    Case(True, tool=Bucket(0.04, 0.04, 4e-4), rises=True),
+    Case(True, tool=Blade(depth=0.015), base=Base(-0.01)),
+)
+"""Each tool, and what it can do; blades and wheels at one height, and rising or sinking."""
 
 
 def bench_grad(

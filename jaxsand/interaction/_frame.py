@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsand.scene.tools import Pose
 
@@ -109,11 +110,26 @@ def shifted(maps: tuple[jax.Array, ...], by: tuple[jax.Array, jax.Array]) -> tup
         x = jnp.where(by[0] > 0, jnp.concatenate([x[:, 1:], jnp.zeros_like(x[:, :1])], 1), x)
         return jnp.where(by[1] > 0, jnp.concatenate([x[1:], jnp.zeros_like(x[:1])], 0), x)
 
+    return bounded(tuple(one(x) for x in maps))
+
+
+def bounded(maps: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    """Maps of fluxes with 0 over the links that lead out of their block, over which what moves would be lost."""
+    size = min(x.shape[0] for x in maps)
+
+    def one(x: jax.Array) -> jax.Array:
+        keep = np.ones(x.shape[:2])
+        for axis in (0, 1):
+            if x.shape[axis] > size:
+                np.swapaxes(keep, 0, axis)[[0, -1]] = 0
+        return x * jnp.asarray(keep, x.dtype).reshape(*x.shape[:2], *(1,) * (x.ndim - 2)) if not keep.all() else x
+
     return tuple(one(x) for x in maps)
 
 
 def shifted_back(maps: tuple[jax.Array, ...], by: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
     """The transpose of `shifted`."""
+    maps = bounded(maps)
 
     def one(x: jax.Array) -> jax.Array:
         x = jnp.where(by[0] > 0, jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], 1), x)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand.interaction._block import Block, First
-from jaxsand.interaction._frame import Frame
+from jaxsand.interaction._frame import Frame, bounded
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.scene.grid import Neighbours, links
 
@@ -63,7 +63,7 @@ def seen(block: Block, frame: Frame, first: First, laid: Laid) -> Fluxes:
     moved = laid.flux
     if block.follows or block.shape[0] != block.shape[1]:  # else the block is the map, in every frame
         column, row = _corner(block, frame, first)
-        moved = tuple(_moved(_moved(f, row - laid.row, 0), column - laid.column, 1) for f in moved)
+        moved = bounded(tuple(_moved(_moved(f, row - laid.row, 0), column - laid.column, 1) for f in moved))
     return _swapped(block.neighbours, _mirrored(block.neighbours, moved, frame.flip_x, frame.flip_y), frame.swap)
 
 

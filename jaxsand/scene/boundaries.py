@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import jax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 
@@ -116,4 +117,4 @@ class Base:
         0.000000 1.0e-06
     """
 
-    height: Float[Array, ""] | Float[Array, "H W"]
+    height: Float[ArrayLike, "H W"] | Float[ArrayLike, ""]
