@@ -97,8 +97,8 @@ def test_sand_that_reaches_the_windows_edge_is_told_and_kept():
     """What flows in a window that moves must not be lost over its edge."""
     rng = np.random.default_rng(0)
     rough = js.settle(js.make_scene((32, 32), 0.01), rng.uniform(0, 0.12, (32, 32))).height
-    small = scene(js.Blade(0.04, 0.01, -0.04), (32, 32), window=js.Window((12, 12)))
-    for path in np.random.default_rng(1).uniform(0.06, 0.26, (8, 3, 2)):
+    small = js.make_scene((32, 32), 0.01, tool=js.Blade(0.04, 0.01, -0.04), window=js.Window((12, 12)))
+    for path in rng.uniform(0.06, 0.26, (8, 3, 2)):
         out = js.follow(small, rough, path)
         assert js.Outcome.WINDOW_EDGE in js.Outcome(int(out.outcome))
         assert np.sum(np.asarray(out.height) - rough) == pytest.approx(0, abs=1e-12)
