@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from jaxsand.interaction.batched import step_batch as step_batch
     from jaxsand.interaction.batched import value_and_grad_batch as value_and_grad_batch
     from jaxsand.interaction.blade_closed_form import SwathPush as SwathPush
-    from jaxsand.interaction.bucket import Load as Load
     from jaxsand.interaction.bucket import Loaded as Loaded
     from jaxsand.interaction.bucket import dump as dump
     from jaxsand.interaction.bucket import load_volume as load_volume
     from jaxsand.interaction.bucket import scoop as scoop
+    from jaxsand.interaction.load import Heaped as Heaped
+    from jaxsand.interaction.load import Load as Load
     from jaxsand.interaction.outcome import OutcomeError as OutcomeError
     from jaxsand.interaction.outcome import check as check
     from jaxsand.interaction.pouring import deposit as deposit
@@ -105,8 +106,9 @@ _HOMES = {
     "Flat": "planning.search.actions",
     "Grid": "scene.grid",
     "Grousers": "scene.tools",
+    "Heaped": "interaction.load",
     "Lattice": "planning.search.actions",
-    "Load": "interaction.bucket",
+    "Load": "interaction.load",
     "Loaded": "interaction.bucket",
     "Material": "scene.material",
     "Multilevel": "relaxation.schemes",

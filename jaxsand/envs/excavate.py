@@ -14,7 +14,8 @@ from jaxsand.envs.pushing import Batching, ByLength, Pushing
 from jaxsand.envs.spaces import Box, Dict
 from jaxsand.envs.zones import NoZones, Told, Zones, kept
 from jaxsand.goals import metrics
-from jaxsand.interaction.bucket import Load, bucket_of, dump, scoop
+from jaxsand.interaction.bucket import bucket_of, dump, scoop
+from jaxsand.interaction.load import Load
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene

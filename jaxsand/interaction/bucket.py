@@ -2,7 +2,7 @@
 
 A bucket's edge cuts as a blade a cell thick at most (blade_stepped.py). What it cuts goes into the bucket until that is
 full; the rest moves ahead. Sand in the bed and in the bucket together keep their volume as well as floats allow: what is
-taken up is counted in whole quanta, and a load is a pair of floats.
+taken up is counted in whole quanta, and a load is a pair of floats (load.py).
 """
 
 from dataclasses import dataclass, replace
@@ -10,14 +10,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Record, farthest, heading
 from jaxsand.interaction.blade_stepped import scoop_along
+from jaxsand.interaction.load import Load, added, as_load, inside_of, one_load, spilled
 from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured
 from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, as_path, itself, lifted, ready
 from jaxsand.interaction.stepped import SteppedPush
@@ -26,32 +25,7 @@ from jaxsand.relaxation.settling import relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import Blade, Bucket, Pose
-from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import Whole, Window
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Load:
-    """What a bucket holds: the volume is (high + low) dx^2, as `load_volume` says in m^3.
-
-    Two floats hold it, so that no sand is lost to rounding, however often the bucket is filled and emptied.
-
-    Attributes:
-        high: sum of heights of cells (m), as one float has it.
-        low: what that leaves out (m).
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> import jaxsand as js
-        >>> scene = js.make_scene((16, 16), 0.01, tool=js.Bucket(width=0.04, length=0.03, capacity=2e-5))
-        >>> scooped = js.scoop(scene, jnp.zeros((16, 16)), jnp.array([[0.04, 0.08, -0.01], [0.08, 0.08, -0.01]]))
-        >>> print(f"{js.load_volume(scene, scooped.load):.2e}")
-        1.60e-05
-    """
-
-    high: Float[Array, "*batch"]
-    low: Float[Array, "*batch"]
 
 
 @jax.tree_util.register_dataclass
@@ -158,9 +132,10 @@ def _scoop(
     path = as_path(path, height.dtype)
     if path.shape[1] == 2:
         path = jnp.concatenate([path, jnp.full_like(path[:, :1], -jnp.asarray(bucket.depth, path.dtype))], 1)
-    held = _one_load(load, height.dtype)
+    inside = inside_of(scene, bucket)
+    held = one_load(load, height.dtype, inside)
     capacity = jnp.asarray(bucket.capacity, height.dtype)
-    run = partial(_scooped, height, path, held, capacity, rules, record=record)
+    run = partial(_scooped, height, path, held, capacity, inside, rules, record=record)
     return as_needed(run, edge, rules, (height, path, held, capacity))
 
 
@@ -206,13 +181,13 @@ def dump(
         >>> print(f"{js.load_volume(scene, poured.load):.0e} {poured.height[10:12, 10:12].mean():.3f}")
         0e+00 0.013
     """
-    bucket_of(scene)
+    inside = inside_of(scene, bucket_of(scene))
     if amount is not None:
         check_amount("amount", amount, "give what to pour, or None for all of it")
     scheme, stop = check_rule(scene, scheme, stop)
     scene, height = fit(scene, height)
     path = as_path(path, height.dtype, 1)[:, :2]
-    held = _one_load(load, height.dtype)
+    held = one_load(load, height.dtype, inside)
     pour = None if amount is None else as_array("amount", amount, height.dtype)
     return _dumped(scene, height, path, held, pour, cast((scheme, stop), height.dtype))
 
@@ -228,7 +203,7 @@ def load_volume(scene: Scene, load: Load | None) -> Float[Array, "*batch"]:
     """
     check_scene(scene)
     dx = jnp.asarray(scene.grid.spacing)
-    held = _load(load, None if load is not None else jnp.result_type(dx))
+    held = as_load(load, None if load is not None else jnp.result_type(dx))
     return (held.high + held.low) * dx.astype(held.high.dtype) ** 2
 
 
@@ -241,50 +216,13 @@ def bucket_of(scene: Scene) -> Bucket:
     return scene.tool
 
 
-def _load(load: Load | None, dtype: jax.typing.DTypeLike | None) -> Load:
-    """The load in a dtype, or its own, rounded no more than two floats are; ValueError, with the field, if it is none."""
-    if load is None:
-        return Load(jnp.zeros((), dtype), jnp.zeros((), dtype))
-    if not isinstance(load, Load):
-        raise ValueError(f"load: got {type(load).__name__}; give the .load of what scoop or dump returned, or None")
-    high, low = as_array("load.high", load.high), as_array("load.low", load.low)
-    dtype = dtype or high.dtype
-    rounded = high.astype(dtype)
-    return Load(rounded, (high - rounded.astype(high.dtype) + low.astype(high.dtype)).astype(dtype))
-
-
-def _one_load(load: Load | None, dtype: jax.typing.DTypeLike) -> Load:
-    """`_load` of a single map: two numbers of which the sum is finite and 0 or more; what is being traced passes."""
-    held = _load(load, dtype)
-    for name, part in (("load.high", held.high), ("load.low", held.low)):
-        if part.ndim:
-            raise ValueError(f"{name}: got shape {list(part.shape)}; give the load of one map, and use jax.vmap for many")
-    known = concrete(held.high)
-    if known is not None and not (np.isfinite(known) and known >= 0):
-        raise ValueError(f"load.high: got {known}; it must be finite and 0 or more: give the .load of what scoop returned")
-    return held
-
-
-def _added(load: Load, account: tuple[jax.Array, jax.Array], sign: float) -> Load:
-    """The load with an account (low, high) added or taken away, without rounding beyond that of the second float."""
-    high, rest = _two_sum(load.high, sign * account[1])
-    low = load.low + sign * account[0] + rest
-    return Load(*_two_sum(high, low))
-
-
-def _two_sum(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """a + b as a float, and what rounding left of it (Knuth's two-sum)."""
-    whole = lax.optimization_barrier(a + b)
-    other = lax.optimization_barrier(whole - a)
-    return whole, lax.stop_gradient((a - lax.optimization_barrier(whole - other)) + (b - other))
-
-
 @partial(jax.jit, static_argnames="record")
 def _scooped(
     height: jax.Array,
     path: jax.Array,
     load: Load,
     capacity: jax.Array,
+    inside: Scene | None,
     rules: Rules,
     scene: Scene,
     window: Whole | Window,
@@ -298,8 +236,12 @@ def _scooped(
     path = jnp.where(sound, path, jnp.nan)  # which leaves the map as it is, and is told of
     pushed, frames, account = scoop_along(scene, height, path, push, room, record)
     edge = replace(pushed, pose=replace(pushed.pose, x=path[-1, 0], y=path[-1, 1]))
-    shaped = lifted(edge, relax(scene, pushed.height, scheme, stop, window))
-    return Loaded(**vars(shaped), load=jax.tree.map(partial(jnp.where, sound), _added(load, account, 1), load)), frames
+    load = jax.tree.map(partial(jnp.where, sound), added(load, account, 1), load)
+    if inside is not None:
+        after, load, missed = spilled(scene, inside, edge.pose, edge.height, load)
+        edge = replace(edge, height=after, outcome=edge.outcome | missed)
+    shaped = lifted(edge, relax(scene, edge.height, scheme, stop, window))
+    return Loaded(**vars(shaped), load=load), frames
 
 
 @jax.jit
@@ -330,4 +272,4 @@ def _dumped(
     way, _ = heading(path[-2 if path.shape[0] > 1 else 0], path[-1], None)
     pose = Pose(path[-1, 0], path[-1, 1], way.cos, way.sin)
     fields = {**vars(settled), "outcome": outcome}
-    return Loaded(**fields, pose=pose, load=jax.tree.map(partial(jnp.where, sound), _added(held, account, -1), load))
+    return Loaded(**fields, pose=pose, load=jax.tree.map(partial(jnp.where, sound), added(held, account, -1), load))

@@ -211,6 +211,14 @@ def relax(scene: Scene, height: Float[Array, "H W"], scheme: Scheme, stop: Stop,
     return _judge(scene, bed, stop, height, sand, sweeps, touched)
 
 
+def run_off(scene: Scene, height: Float[Array, "H W"], scheme: Scheme, stop: Stop) -> tuple[jax.Array, jax.Array]:
+    """The map after settling, and what each of its cells lost over the draining edge (m); inside a compiled program."""
+    bed = prepare(scene)
+    (u, lost), _ = _run(scene, bed, scheme, stop, (halo(mark(scene, height)[0]), nothing_lost(bed, height)))
+    assert lost is not None
+    return at(u), lost[0] + lost[1]
+
+
 def _judge(
     scene: Scene, bed: Bed, stop: Stop, height: jax.Array, sand: Sand, sweeps: jax.Array, touched: jax.Array
 ) -> Settled:

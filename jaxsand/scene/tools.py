@@ -121,14 +121,17 @@ class Bucket:
     """A bucket that scoops sand with its front edge, carries it, and dumps it.
 
     `scoop` moves the edge along a path: what it cuts goes into the bucket until that is full, and the rest is pushed ahead,
-    as by a blade. `dump` pours it out, across the bucket's width. What it holds is one number; see `Load`.
+    as by a blade. `dump` pours it out, across the bucket's width. What it holds is one number, or, with walls, a heap; see
+    `Load` and `Heaped`.
 
     Attributes:
         width: extent of the edge across the direction of travel (m), at least one cell.
-        length: extent along the direction of travel (m), at least one cell. What the bucket holds is one number, so its
-            length moves no sand.
+        length: extent along the direction of travel (m), at least one cell. It moves no sand.
         capacity: volume that it holds when full (m^3), above 0.
         depth: depth of the edge below height 0 (m) on paths without heights.
+        walls: height of its walls above its floor (m): what it holds is then a small map, in whole cells of the bed, that
+            keeps to repose; what does not stay spills over the walls onto the bed after each scoop. None for a load that is
+            one number, which costs nothing.
 
     Example:
         >>> import jaxsand as js
@@ -141,6 +144,7 @@ class Bucket:
     length: Number
     capacity: Number
     depth: Number = 0.0075
+    walls: Number | None = None
 
     def check(self, grid: Grid) -> None:
         """Raises ValueError if a length is out of range, or less than a cell, or it holds nothing; see `Tool`."""
@@ -148,6 +152,8 @@ class Bucket:
         positive("tool.length", self.length, "give the bucket's length in metres")
         positive("tool.capacity", self.capacity, "give what the bucket holds in m^3")
         finite("tool.depth", self.depth, "give the depth of the bucket's edge below height 0 in metres")
+        if self.walls is not None:
+            positive("tool.walls", self.walls, "give the height of the bucket's walls in metres, or None")
         sizes = {"width": self.width, "length": self.length}
         _at_least_a_cell("bucket", sizes, grid)
         _within_the_map(sizes, grid)

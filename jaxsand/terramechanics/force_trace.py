@@ -15,8 +15,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction import substeps as parts
-from jaxsand.interaction.bucket import Load, scoop_frames
+from jaxsand.interaction.bucket import scoop_frames
 from jaxsand.interaction.ground import ground_of
+from jaxsand.interaction.load import Load
 from jaxsand.interaction.simulate import Path, Shaped, as_path, follow, follow_frames
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Scheme
