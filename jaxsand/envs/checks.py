@@ -92,6 +92,8 @@ def check_zones(scene: Scene, zones: Zones) -> None:
     """Raises ValueError for zones that are not booleans of the scene's shape; traced ones are not checked."""
     if isinstance(zones, NoZones):
         return
+    if not hasattr(zones.cells, "dtype"):
+        raise ValueError("zones.cells: got no array; give an array of booleans, such as np.array(cells)")
     cells = concrete(unmasked("zones.cells", zones.cells, "say of each whether the tool may be there: cells.filled(True)"))
     if cells is not None and (cells.dtype != bool or cells.shape != scene.grid.shape):
         raise ValueError(

@@ -46,7 +46,14 @@ class RandomDigs:
 
     def plans(self, rng: np.random.Generator, heights: Heights) -> list[np.ndarray]:
         """Draws the digs [n, 9] for each goal, x and y in the unit square, z in depths of the bucket; all is poured."""
-        if not (self.goals >= 1 and 1 <= self.fewest <= self.most and 0 <= self.shortest <= 0.5 and 0 <= self.apart <= 0.5):
+        whole = all(isinstance(n, int) for n in (self.goals, self.fewest, self.most))
+        if not (
+            whole
+            and self.goals >= 1
+            and 1 <= self.fewest <= self.most
+            and 0 <= self.shortest <= 0.5
+            and 0 <= self.apart <= 0.5
+        ):
             raise ValueError(
                 f"goals: got {self}; give one goal or more, 1 <= fewest <= most, and shortest and apart from 0 to 0.5"
             )

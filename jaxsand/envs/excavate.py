@@ -61,7 +61,8 @@ class ExcavateParams:
       scene: grid, sand and a `Bucket`.
       goals: what an episode draws its goal and its start from.
       limit: actions after which an episode is truncated.
-      zones: where the bucket may not be: `NoZones()`, `ClippedBy(cells)` or `RefusedBy(cells)`.
+      zones: where the bucket's edge may not be, and no sand be poured: `NoZones()`, `ClippedBy(cells)` or
+        `RefusedBy(cells)`.
 
     Example:
       >>> import numpy as np

@@ -68,7 +68,8 @@ class Heights:
     size = 6  # numbers of a stroke
 
     def __post_init__(self) -> None:
-        if not -math.inf < self.lowest < self.highest < math.inf:
+        known = all(isinstance(x, int | float) for x in (self.lowest, self.highest))
+        if not known or not -math.inf < self.lowest < self.highest < math.inf:
             raise ValueError(f"heights: got {self}; give lowest < highest, as multiples of the tool's depth")
 
     def stroke(self, action: jax.Array, grid: Grid, depth: jax.typing.ArrayLike) -> jax.Array:

@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxsand.interaction.obstacles import free_way
 from jaxsand.scene.grid import Grid
@@ -13,6 +14,7 @@ from jaxsand.scene.tools import Number
 Told = dict[str, jax.Array]
 """What `info` says of zones: nothing where there are none."""
 Tree = TypeVar("Tree")
+_LEAST = 1e-2  # spacings: a stroke that would be clipped to less is not made
 
 
 @jax.tree_util.register_dataclass
@@ -44,9 +46,10 @@ class ClippedBy:
     """Tells an environment that a stroke ends where its tool's footprint would first enter a zone.
 
     Where that is, is exact, and differentiable in the stroke; heights end where they are by then. A stroke whose tool would
-    come down on a zone is not made. `info` holds "clipped", whether the stroke met a zone, and "went", the share of its way
-    that was made, 0 to 1; 0 leaves the map as it was. Zones keep the tool out; sand may flow there. A scene's walls hold no
-    sand, but let tools pass, unless their cells are given here too.
+    come down on a zone, or be clipped to less than a hundredth of a spacing, is not made. The footprint is a blade's; of a
+    bucket it is its edge, behind which it hangs above the sand. `info` holds "clipped", whether the stroke met a zone, and
+    "went", the share of its way that was made, 0 to 1; 0 leaves the map as it was. Zones keep the tool out; sand may flow
+    there. A scene's walls hold no sand, but let tools pass, unless their cells are given here too.
 
     Args:
       cells: booleans [H, W], true where the tool may not be.
@@ -71,6 +74,8 @@ class ClippedBy:
         """The part of a stroke [4] or [6] (m) that is made, and what to tell."""
         start, stop = stroke.reshape(2, -1)
         met, share = free_way(self.cells, grid, start[:2], stop[:2], width, thickness)
+        left = lax.stop_gradient(share * jnp.hypot(*(stop - start)[:2]))  # of a shorter way floats do not tell the heading
+        share = jnp.where((met & (left < _LEAST * grid.spacing)) | ~jnp.all(jnp.isfinite(stroke)), 0, share)
         made = jnp.concatenate([start, jnp.where(met, start + share * (stop - start), stop)])
         return made, {"clipped": met, "went": share}
 
@@ -103,7 +108,8 @@ class RefusedBy:
         """The stroke [4] or [6] (m) as it is, and what to tell."""
         start, stop = stroke.reshape(2, -1)
         met, _ = free_way(self.cells, grid, start[:2], stop[:2], width, thickness)
-        return stroke, {"clipped": met, "went": jnp.where(met, 0, jnp.ones_like(start[0]))}
+        made = ~met & jnp.all(jnp.isfinite(stroke))
+        return stroke, {"clipped": met, "went": jnp.where(made, jnp.ones_like(start[0]), 0)}
 
     def over(self, point: jax.Array, grid: Grid) -> Told:
         """Whether a bucket may be emptied over a point x, y (m)."""

@@ -307,7 +307,7 @@ def fits_where_it_counts(scene: Scene, goal: np.ndarray, name: str = "goal") -> 
       >>> js.task.fits_where_it_counts(js.make_scene((4, 4), 0.01), goal)
     """
     if np.isnan(goal).all():
-        finite(goal, name)
+        raise ValueError(f"{name}: got NaN, free, in every cell; give a height where it matters")
     fits(scene, np.where(np.isnan(goal), 0, goal), name)
 
 

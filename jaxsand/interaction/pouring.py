@@ -137,20 +137,21 @@ def _settled(
     amount = volume / scene.grid.spacing**2
     bed, there = prepare(scene), amount
     if bed.base is not None and sign < 0:
-        where, there = _on_floor(bed, mark(scene, height)[0] - bed.base, where, amount)
+        where, there = _on_floor(bed, mark(scene, height)[0], where, amount)
     changed, _, missed = poured(scene, height, where, amount, (jnp.zeros_like(amount), there), sign)
     settled = relax(scene, changed, *rules)
     return replace(settled, outcome=settled.outcome | missed)
 
 
-def _on_floor(bed: Bed, thick: jax.Array, weights: jax.Array, amount: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What each cell gives of a sum of heights `amount` (m) taken from sand of some thickness, and the most there is.
+def _on_floor(bed: Bed, height: jax.Array, weights: jax.Array, amount: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What each cell gives of a sum of heights `amount` (m) that is taken from a marked map, and the most there is.
 
     Cell k gives min(s w_k, t_k), of weight w_k and thickness t_k, with s such that the sum is the amount.
     """
     assert bed.base is not None
-    spare = 4 * quantum(2 * (largest(bed.base) + largest(thick)))  # so that rounding takes no cell below its floor
-    weights = jnp.where(weights > 0, weights, 0)
+    thick, weights = height - bed.base, jnp.where(weights > 0, weights, 0)
+    most = jnp.minimum(largest(thick), amount)
+    spare = 4 * quantum(2 * (largest(height) + most))  # so that rounding takes no cell below its floor
     thick = jnp.where((thick > spare) & (weights > 0), thick - spare, 0)
     weights = weights / jnp.where(jnp.max(weights) > 0, jnp.max(weights), 1)
     most = jnp.sum(jnp.sum(thick, axis=0))

@@ -173,7 +173,8 @@ class _Gradients:
             part = share_beyond(zx * zx + zy * zy, rate * self.sand.drop)
             out += [zx * part, zy * part]
         if self.sand.sides is not None:
-            out.append(_over(self.sand, self.rate, y[-1], inner(around)))
+            over = _over(self.sand, self.rate, y[-1], inner(around))
+            out.append(over if self.there is None else jnp.minimum(over, self.there))
         return tuple(out)
 
     def gained(self, flux: Fluxes) -> jax.Array:
@@ -183,8 +184,11 @@ class _Gradients:
         over_x = (jnp.concatenate([column, east], 1) + jnp.concatenate([west, column], 1)) / 4
         over_y = (jnp.concatenate([row, north], 0) + jnp.concatenate([south, row], 0)) / 4
         moved = tuple(truncate(f * _felt(g)) for f, g in zip((over_x, over_y), self.sand.gates, strict=True))
-        moved = (*lax.optimization_barrier(moved), *((flux[-1],) if self.sand.sides is not None else ()))
-        return _gained(self.sand, moved if self.there is None else no_more_than("isotropic", self.there, moved))
+        moved = lax.optimization_barrier(moved)
+        over = () if self.sand.sides is None else (flux[-1],)
+        if self.there is not None:  # what runs off over the rim goes first, and is what the fluxes say
+            moved = no_more_than("isotropic", self.there - sum(over), moved)
+        return _gained(self.sand, (*moved, *over))
 
 
 def _both_ends(arms: list[jax.Array]) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:

@@ -109,10 +109,11 @@ class SandLoss:
 
     @property
     def bounds(self) -> np.ndarray:
-        """The lowest and the highest x0, y0, x1, y1 (m) that a stroke may have: [2, 4]."""
+        """The lowest and the highest x0, y0, x1, y1 (m) that a stroke may have, those of cells' centres: [2, 4]."""
         rows, columns = self.scene.grid.shape
-        high = np.array([columns - 1, rows - 1, columns - 1, rows - 1]) * float(self.scene.grid.spacing)
-        return np.stack([np.zeros(4), high])
+        spacing = float(self.scene.grid.spacing)
+        high = np.array([columns, rows, columns, rows]) * spacing - spacing / 2
+        return np.stack([np.full(4, spacing / 2), high])
 
     @property
     def target(self) -> np.ndarray:

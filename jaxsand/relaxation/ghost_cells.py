@@ -31,7 +31,7 @@ class Bed:
         drop: largest stable step between straight neighbours, tan(angle of repose) dx (m).
         rim: the draining edge, or None where the edge is closed.
         base: height of the floor under the sand (m), or None for a bed without one.
-        elsewhere: largest |height| outside the block of the map that is swept, of the floor, or of a rim below 0 (m).
+        elsewhere: largest |height| outside the block of the map that is swept, or the depth of the rim below 0 (m).
         neighbours: 4, 8 or "isotropic".
     """
 
@@ -69,7 +69,6 @@ def prepare(scene: Scene) -> Bed:
     base = None
     if isinstance(scene.base, Base):
         base = jnp.broadcast_to(jnp.asarray(scene.base.height), scene.grid.shape)
-        deep = jnp.maximum(deep, jnp.max(jnp.abs(lax.stop_gradient(base))))
     return Bed(dx, drop, rim, base, deep, scene.grid.neighbours)
 
 
@@ -105,8 +104,9 @@ def below_base(bed: Bed, height: Float[Array, "H W"]) -> Bool[Array, ""]:
 
 
 def sound(bed: Bed) -> Bool[Array, ""]:
-    """Whether spacing and angles are in range; checks traced values, which `make_scene` cannot."""
-    return jnp.all(jnp.isfinite(bed.drop) & (bed.drop >= 0)) & (bed.spacing > 0)
+    """Whether spacing, angles and floor are in range; checks traced values, which `make_scene` cannot."""
+    good = jnp.all(jnp.isfinite(bed.drop) & (bed.drop >= 0)) & (bed.spacing > 0)
+    return good if bed.base is None else good & ~jnp.any(jnp.isnan(bed.base))
 
 
 def largest(height: Float[Array, "..."]) -> Float[Array, ""]:

@@ -68,6 +68,8 @@ class Blade:
     the left where it is positive. What the blade covers leaves along its normal, turned towards the way by the angle of
     repose at most, as sand that slides on sand would.
 
+    An angle above pi/4 leaves some sand in the swath of a blade that is hardly thicker than a cell.
+
     A blade with plates, a box blade, carries its heap instead of spilling it to the sides, as long as the heap's toe lies
     between the plates: V / w of it (m^2) has its toe sqrt(2 V / (w mu)) ahead. A plate is a cell thick and as deep as the
     blade; it stands beside the blade's end. While the blade turns in place, its plates are up.
@@ -276,11 +278,14 @@ def _check_load(wheel: Wheel) -> None:
     positive("tool.load", wheel.load, "give newtons, or None for a wheel at a fixed sinkage")
     if wheel.soil is not None and not isinstance(wheel.soil, Soil):
         raise ValueError(f"tool.soil: got {short(wheel.soil)}; give a js.forces.Soil, or None for a dry sand")
+    spin = concrete(wheel.grousers.spin) if isinstance(wheel.grousers, Grousers) and wheel.slip is None else None
+    if spin is not None and not (spin.ndim == 0 and spin >= 1):
+        remedy = "give a slip ratio of 0 to 1, which is 1 - 1 / spin of a driven wheel"
+        raise ValueError(f"tool.grousers.spin: got {short(spin)} under a load; {remedy}")
     soil, slip = soil_of(wheel), concrete(slip_of(wheel))
     check_soil(soil)
     if slip is not None and not (slip.ndim == 0 and 0 <= slip <= 1):
-        named = f"slip: got {short(wheel.slip)}" if wheel.slip is not None else "grousers.spin: got less than 1 under a load"
-        raise ValueError(f"tool.{named}; give a slip ratio of 0 to 1, which is 1 - 1 / spin of a driven wheel")
+        raise ValueError(f"tool.slip: got {short(wheel.slip)}; give a slip ratio of 0 to 1, 1 - 1 / spin of a driven wheel")
     if any(concrete(leaf) is None for leaf in jax.tree.leaves((wheel, soil))):
         return
     with jax.ensure_compile_time_eval():

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxsand.scene.boundaries import Base
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, cast, fit
 from jaxsand.scene.soil import TINY, Scalar, Soil, check_number, check_soil
@@ -242,7 +243,9 @@ def cut_ahead(scene: Scene, height: jax.typing.ArrayLike, pose: Pose, soil: Soil
     middle = Pose(pose.x + ahead * pose.cos, pose.y + ahead * pose.sin, pose.cos, pose.sin)
     share = coverage(Blade(blade.width, dx), middle, *centres(scene.grid, height.dtype), dx)
     share /= jnp.maximum(jnp.sum(share), TINY)
-    bottom = -jnp.asarray(blade.depth)
+    bottom = jnp.broadcast_to(-jnp.asarray(blade.depth), height.shape)
+    if isinstance(scene.base, Base):  # no tool cuts the floor
+        bottom = jnp.maximum(bottom, scene.base.height)
     depth = jnp.sum(share * jnp.maximum(jnp.minimum(height, level) - bottom, 0))
     heap = jnp.sum(share * jnp.maximum(height - jnp.maximum(level, bottom), 0))
     return Cut(depth, blade.width, surcharge=heap * soil.unit_weight, sides=2.0)

@@ -23,8 +23,9 @@ from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.stopping import Stop, check_whole
 from jaxsand.scene.bearing import wheel_force
+from jaxsand.scene.boundaries import Base
 from jaxsand.scene.scene import Scene, cast, check_scene, fit
-from jaxsand.scene.soil import WONG_DRY_SAND, Soil
+from jaxsand.scene.soil import WONG_DRY_SAND, Soil, check_soil
 from jaxsand.scene.tools import Blade, Bucket, Pose, Wheel, slip_of, soil_of, square, sunk
 from jaxsand.terramechanics.cutting import cut_ahead, cut_force
 
@@ -94,7 +95,8 @@ def follow_forces(
 
     The work of a sub-step is the mean of what is felt at its ends, times its length: of second order in that where the force
     is smooth. A turn in place costs nothing. The map is that of a path with as many legs as there are sub-steps, whose
-    heights are kept: m maps. Differentiable like `follow`, in the soil too.
+    heights are kept: m maps. A blade or an edge cuts no floor (`Base`), and feels none. Differentiable like `follow`, in the
+    soil too.
 
     Args:
       scene: the scene, with a `Blade` that stands square to its way, a `Wheel` or a `Bucket`.
@@ -111,7 +113,7 @@ def follow_forces(
       The result of `follow` or `scoop`, and the forces after each of the m = substeps (n - 1) sub-steps.
 
     Raises:
-      ValueError: an argument has the wrong shape or is out of range, or the tool is another.
+      ValueError: an argument has the wrong shape or is out of range, the tool is another, or a wheel rolls on a `Base`.
 
     Source: cutting.py and bearing.py say whose equations these are.
 
@@ -136,6 +138,12 @@ def follow_forces(
         square(tool)
     elif not isinstance(tool, Wheel | Bucket):
         raise ValueError(f"scene.tool: got {type(tool).__name__}; give the scene a Blade, a Wheel or a Bucket")
+    if isinstance(tool, Wheel) and isinstance(scene.base, Base):
+        raise ValueError("scene.base: got a Base under a wheel, whose forces on a floor are not known; give Deep()")
+    if soil is not None:
+        if not isinstance(soil, Soil):
+            raise ValueError(f"soil: got {type(soil).__name__}; give a js.forces.Soil, or None for a dry sand")
+        check_soil(soil)
     if load is not None and not isinstance(tool, Bucket):
         raise ValueError(f"load: got one for a {type(tool).__name__}; only a Bucket has one")
     if isinstance(tool, Wheel) and tool.load is not None and soil is not None:

@@ -172,6 +172,9 @@ def _box(start: float, stop: float, tall: float) -> np.ndarray:
 
 def _profiles(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], far: np.ndarray, points: np.ndarray) -> None:
     for k, (name, height) in enumerate(maps.items()):
+        if np.shape(height) != scene.grid.shape:
+            remedy = f"give a map of shape {list(scene.grid.shape)}"
+            raise ValueError(f"maps[{name!r}]: got shape {list(np.shape(height))}; {remedy}")
         heights = section(np.asarray(height), float(scene.grid.spacing), points)
         axes.plot(far, 1e3 * heights, label=name, **_LOOKS[k % len(_LOOKS)])
     axes.margins(x=0.02)
@@ -189,6 +192,8 @@ def _walked(path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
 def _bottom(tool: Tool, path: np.ndarray, far: np.ndarray) -> np.ndarray:
     """Heights [k] (m) of the tool's lowest point at distances [k] (m) along a path."""
     path = _checked(path)
+    if isinstance(tool, Wheel) and tool.load is not None:
+        raise ValueError("scene.tool: got a wheel under a load, which follows the ground; give one at its sinkage")
     if path.shape[1] == 2:
         own = float(tool.sinkage if isinstance(tool, Wheel) else getattr(tool, "depth", 0.0))
         return np.full(len(far), -own)
@@ -204,6 +209,8 @@ def _ahead(run: np.ndarray) -> np.ndarray:
 
 def _checked(path: np.ndarray) -> np.ndarray:
     path = np.asarray(path, float)
+    if not np.isfinite(path).all():
+        raise ValueError("path: got a number that is not finite; give every point in metres")
     if path.ndim != 2 or len(path) < 2 or path.shape[1] not in (2, 3) or not np.ptp(path[:, :2], axis=0).any():
         raise ValueError(f"path: got shape {list(path.shape)}; give two points or more, [n, 2] or [n, 3], that lie apart")
     return path

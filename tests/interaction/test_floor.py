@@ -163,3 +163,24 @@ def test_derivatives(neighbours):
 def test_closed_forms_refuse_floors(push, tool):
     with pytest.raises(ValueError, match="on a Base, which it does not know"):
         js.step(on(-0.1, tool), LEVEL, [0.05, 0.05, 0.1, 0.1], push=push)
+
+
+@pytest.mark.parametrize("neighbours", ["isotropic", pytest.param(8, marks=pytest.mark.slow)])
+def test_what_drains_off_a_floor_is_what_the_map_loses(neighbours):
+    tray = on(-0.01, js.Blade(0.05, 0.015, 0.03), neighbours, edge=js.Draining(-0.02))
+    sand = js.settle(tray, LEVEL).height
+    out = js.act(tray, sand, [0.03, 0.1, 0.12, 0.1])
+    js.check(out)
+    assert float(out.drained) == pytest.approx(DX**2 * float((sand - out.height).sum()), rel=1e-9)
+    assert float(out.drained) > 1e-5
+
+
+def test_a_blade_feels_no_floor():
+    """Forces are those of the sand that is cut: none on bare floor, and no more than lies upon it."""
+    soil, path = js.forces.WONG_DRY_SAND, [[0.05, 0.1], [0.1, 0.1]]
+    feel = [
+        np.abs(js.forces.follow_forces(on(base, js.Blade(0.06, 0.015, depth)), LEVEL, path, soil, substeps=1)[1].force).max()
+        for base, depth in ((0.0, 0.02), (-0.01, 0.05), (-0.2, 0.01))
+    ]
+    assert feel[0] == 0
+    assert feel[1] == pytest.approx(feel[2], rel=0.02)

@@ -142,6 +142,24 @@ def test_derivatives(neighbours):
         assert float(np.sum(np.asarray(slope[name]) * along)) == pytest.approx(expected, rel=1e-4, abs=1e-5)
 
 
+def test_one_deep_cell_changes_nothing_elsewhere():
+    """In float32, where a scale of that depth would be coarser than sand."""
+    spike = np.zeros((N, N), "float32")
+    spike[10, 10] = 0.1
+    hole = np.full((N, N), -0.01)
+    hole[0, 0] = -1e6
+    deep, flat = (np.asarray(js.settle(on(base), spike).height) for base in (hole, -0.01))
+    assert np.abs(deep - flat).max() < 1e-7
+    pit = js.remove(on(-1e6), 0 * spike, [0.1, 0.1], 1e-5)
+    js.check(pit)
+    assert DX**2 * np.sum(np.asarray(pit.height, float)) == pytest.approx(-1e-5, rel=1e-5)
+
+
+def test_a_traced_floor_of_nan_is_an_outcome():
+    outcome = jax.jit(lambda base: js.settle(on(base), HEAP).outcome)(np.nan)
+    assert js.Outcome.NOT_FINITE in js.Outcome(int(outcome))
+
+
 def test_a_map_below_its_floor_is_an_outcome():
     out = js.settle(on(0.0), np.full((N, N), -0.01))
     assert js.Outcome(int(out.outcome)) == js.Outcome.BELOW_BASE

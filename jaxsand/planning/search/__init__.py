@@ -184,13 +184,16 @@ def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, se
                 f"give spacings with pitch and shortest at most longest, and at most {largest}"
             )
     elif isinstance(actions, Rising | Flat):
-        across = math.hypot(*scene.grid.shape)
+        across = math.hypot(*(n - 1 for n in scene.grid.shape))
+        for name in ("shortest", "longest", "lowest", "highest"):
+            if not isinstance(getattr(actions, name), int | float):
+                raise ValueError(f"actions.{name}: got {getattr(actions, name)!r}; give a number")
         if not 0 < actions.shortest <= min(actions.longest, across):
             raise ValueError(
                 f"actions.shortest: got {actions.shortest!r} with longest {actions.longest!r}; "
                 f"give spacings, above 0, at most longest, and at most {across:.4g}"
             )
-        if not actions.lowest <= actions.highest:
+        if not actions.lowest <= actions.highest or math.inf in (actions.lowest, -actions.highest):
             raise ValueError(
                 f"actions.lowest: got {actions.lowest!r} with highest {actions.highest!r}; "
                 "give heights in metres, at most highest"

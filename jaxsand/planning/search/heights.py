@@ -110,7 +110,11 @@ def within(job: Job, strokes: np.ndarray) -> np.ndarray:
     run = np.where(length > 0, run, [1.0, 0.0]) / np.where(length > 0, length, 1)
     length = np.clip(length, job.actions.shortest * spacing, longest_stroke(job.scene, job.actions))
     heights = job.actions.allowed(strokes[:, [2, 5]])
-    return np.concatenate([start, heights[:, :1], np.clip(start + run * length, low, high), heights[:, 1:]], axis=1)
+    ends = [np.clip(start + sign * run * length, low, high) for sign in (1, -1)]
+    far = [np.hypot(*(end - start).T)[:, None] for end in ends]
+    fits = (far[0] >= np.minimum(length, far[1]) * (1 - 1e-9)) | (far[0] >= job.actions.shortest * spacing)
+    end = np.where(fits, ends[0], ends[1])  # where the map ends too soon, the other way
+    return np.concatenate([start, heights[:, :1], end, heights[:, 1:]], axis=1)
 
 
 def _varied(job: Job, plan: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[np.ndarray, Effort]:
