@@ -45,6 +45,25 @@ def test_a_stroke_ends_at_the_edge_of_a_zone(make):
     assert (bool(backwards[2]["clipped"]), float(backwards[2]["went"])) == (False, 1)
 
 
+def test_what_begins_at_the_edge_of_a_zone_stays_out_of_it():
+    """Where the last stroke was clipped, the next has hardly any way left, too short for floats to tell its heading."""
+    zone = np.zeros((32, 32), bool)
+    zone[20:] = True
+    scene = js.make_scene((32, 32), 0.01, tool=js.Blade(width=0.1, thickness=0.015))
+    env, params = js.make("multi-stroke", scene=scene, goals=np.zeros((1, 32, 32), np.float32), zones=envs.ClippedBy(zone))
+    step = jax.jit(env.step_env)
+    for degrees in (23, 40, 58, 71):
+        way = 0.2 * np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+        _, state = env.reset(KEY, params)
+        start = np.array([0.14, 0.08])
+        for _ in range(3):
+            action = env.action(jnp.asarray(np.concatenate([start, start + way]), jnp.float32), params)
+            _, state, *_, info = step(KEY, state, action, params)
+            start = start + float(info["went"]) * way
+        assert float(info["went"]) == 0
+        assert np.asarray(state.height)[20:].min() > -1e-4
+
+
 def test_what_may_not_be_made_leaves_the_map_and_counts():
     refused, clipped = level(zones=envs.RefusedBy(RIGHT)), level(zones=envs.ClippedBy(RIGHT))
     for one, stroke in ((refused, THROUGH), (clipped, THROUGH[jnp.array([2, 3, 0, 1])])):  # the second begins in the zone
