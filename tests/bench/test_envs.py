@@ -10,6 +10,7 @@ from jaxsand.bench.envs import KINDS, bench_env
 from jaxsand.bench.report import table
 
 
+@pytest.mark.slow
 def test_a_device_for_each_core_has_its_row():
     code = """
 from jaxsand.bench.envs import bench_env

@@ -18,6 +18,7 @@ X, Y = np.meshgrid((np.arange(20) + 0.5) * 0.02, (np.arange(12) + 0.5) * 0.02)
 RAMP = np.where((X > 0.08) & (X < 0.3) & (Y > 0.06) & (Y < 0.16), 0.2 * (X - 0.19), np.nan)
 
 
+@pytest.mark.slow
 def test_the_bench_tells_errors_of_what_is_built():
     """Of a ramp from its foot the mean error is half its rise at first, from half its height a quarter, but for the odd row."""
     assert ramp("", 0.03, 0.0, {}).error(np.zeros((16, 32))) == pytest.approx(15 - 1 / 15)

@@ -103,6 +103,7 @@ def test_many_plans_at_once_leave_what_the_simulator_leaves(bar):
     np.testing.assert_allclose(losses, ((once - bar.goal) ** 2).sum((1, 2)), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_push_that_touches_its_window_is_pushed_again_on_the_whole_map(bar, monkeypatch):
     small = replace(bar.scene, window=Window((6, 6)))
     assert int(js.step_batch(small, bar.start[None], bar.strokes[:1]).outcome[0]) == Outcome.WINDOW_EDGE

@@ -67,6 +67,7 @@ def test_a_second_derivative_is_refused():
         jax.grad(lambda stroke: slope(stroke).sum())(jnp.asarray(STROKES[0]))
 
 
+@pytest.mark.slow
 def test_by_default_an_environment_has_gradients():
     actions = jnp.float32([[-0.5, -0.4, 0.3, 0.2], [0.1, -0.5, 0.2, -0.3]])
     slopes = []

@@ -180,7 +180,7 @@ def test_sand_pushed_over_a_draining_edge_is_counted(dtype):
     assert float(away.drained) == 0
 
 
-@pytest.mark.usefixtures("both_ways")
+@pytest.mark.slow
 def test_vmap_equals_a_loop():
     strokes, maps = BATCH[:4].astype(np.float32), np.stack([rough("float32", k) for k in range(4)])
     loop = [js.step(scene(), h, s, push=FAST).height for h, s in zip(maps, strokes, strict=True)]
@@ -196,6 +196,7 @@ def test_it_comes_close_to_the_push_in_sub_steps():
     assert np.abs(fast - full).sum() < 0.3 * np.abs(full).sum()
 
 
+@pytest.mark.slow
 def test_a_path_of_legs_takes_its_heap_along(dtype):
     one = np.array([[0.08, 0.16], [0.24, 0.16]])
     three = np.array([[0.08, 0.16], [0.13, 0.16], [0.2, 0.16], [0.24, 0.16]])

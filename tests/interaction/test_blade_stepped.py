@@ -73,8 +73,9 @@ def test_no_sand_inside_the_tool(dtype):
 
 
 @pytest.mark.long
-def test_volume_after_a_thousand_random_pushes():
-    shape, n = (32, 32), 1000
+@pytest.mark.parametrize("n", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_volume_after_many_random_pushes(n):
+    shape = (32, 32)
     sand = js.make_scene(shape, 0.01, ANGLE, tool=js.Blade())
     strokes = np.random.default_rng(0).uniform(-0.02, 0.34, (n, 4)).astype(np.float32)
     start = np.zeros(shape, np.float32)
@@ -185,7 +186,7 @@ def test_sand_and_blade_may_be_raised_together():
     assert np.allclose(np.asarray(b) - 0.5, a, atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_result_is_continuous_in_the_stroke():
     """Steps of a stroke, over several sub-steps' lengths, move the sand by no more than a fixed multiple of their size: by 10,
     but where a blade in line with the cells moves into slivers of them, which is as steep as these are narrow."""
@@ -285,7 +286,7 @@ def test_more_sweeps_and_finer_sub_steps_converge():
     assert errors[1] < 0.12
 
 
-@pytest.mark.usefixtures("both_ways")
+@pytest.mark.slow
 def test_vmap_equals_a_loop_over_maps_and_strokes():
     sand = js.make_scene((24, 24), 0.01, ANGLE, tool=js.Blade())
     rng = np.random.default_rng(5)

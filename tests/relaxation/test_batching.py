@@ -32,8 +32,17 @@ def same(a, b):
         assert np.all((np.abs(x - y) <= rounding) | (np.isnan(x) & np.isnan(y))), name
 
 
-@pytest.mark.parametrize("edge", [js.Closed(), js.Draining(-0.01)])
-@pytest.mark.parametrize("scheme", [None, js.Relaxation(), js.Pairwise()])
+@pytest.mark.parametrize(
+    ("scheme", "edge"),
+    [
+        (None, js.Closed()),
+        (js.Pairwise(), js.Draining(-0.01)),
+        pytest.param(None, js.Draining(-0.01), marks=pytest.mark.slow),
+        pytest.param(js.Relaxation(), js.Closed(), marks=pytest.mark.slow),
+        pytest.param(js.Relaxation(), js.Draining(-0.01), marks=pytest.mark.slow),
+        pytest.param(js.Pairwise(), js.Closed(), marks=pytest.mark.slow),
+    ],
+)
 def test_a_batch_is_its_maps(scheme, edge, dtype):
     scene = js.make_scene(SHAPE, DX, ANGLE, walls=js.Walls(jnp.zeros(SHAPE, bool).at[7, 3:9].set(True)), edge=edge)
     h = maps(dtype)

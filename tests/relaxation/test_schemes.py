@@ -115,6 +115,7 @@ def test_multilevel_comes_close_and_closer_with_a_later_handover():
     assert errors[1] < errors[0] / 2
 
 
+@pytest.mark.slow
 def test_multilevel_respects_walls_and_draining_edges():
     h = rough((35, 44), "float32", scale=0.2) + np.float32(0.25)
     solid = np.zeros(h.shape, bool)

@@ -75,7 +75,7 @@ def check_cones(rows):
         assert row["sand_error_deg"] < 0.3
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_exact_cones_angle_lies_within_two_stated_errors(monkeypatch):
     monkeypatch.setattr("jaxsand.bench.calibration._seconds", lambda *_: 0.0)  # no clock is asked
     check_cones(bench_cone(seeds=1))
