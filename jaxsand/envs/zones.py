@@ -75,7 +75,7 @@ class ClippedBy:
         start, stop = stroke.reshape(2, -1)
         met, share = free_way(self.cells, grid, start[:2], stop[:2], width, thickness)
         left = lax.stop_gradient(share * jnp.hypot(*(stop - start)[:2]))  # of a shorter way floats do not tell the heading
-        share = jnp.where((met & (left < _LEAST * grid.spacing)) | ~jnp.all(jnp.isfinite(stroke)), 0, share)
+        share = jnp.where(met & (left < _LEAST * grid.spacing), 0, share)
         made = jnp.concatenate([start, jnp.where(met, start + share * (stop - start), stop)])
         return made, {"clipped": met, "went": share}
 
@@ -108,8 +108,7 @@ class RefusedBy:
         """The stroke [4] or [6] (m) as it is, and what to tell."""
         start, stop = stroke.reshape(2, -1)
         met, _ = free_way(self.cells, grid, start[:2], stop[:2], width, thickness)
-        made = ~met & jnp.all(jnp.isfinite(stroke))
-        return stroke, {"clipped": met, "went": jnp.where(made, jnp.ones_like(start[0]), 0)}
+        return stroke, {"clipped": met, "went": jnp.where(met, 0, jnp.ones_like(start[0]))}
 
     def over(self, point: jax.Array, grid: Grid) -> Told:
         """Whether a bucket may be emptied over a point x, y (m)."""

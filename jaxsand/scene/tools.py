@@ -281,7 +281,7 @@ def _check_load(wheel: Wheel) -> None:
     spin = concrete(wheel.grousers.spin) if isinstance(wheel.grousers, Grousers) and wheel.slip is None else None
     if spin is not None and not (spin.ndim == 0 and spin >= 1):
         remedy = "give a slip ratio of 0 to 1, which is 1 - 1 / spin of a driven wheel"
-        raise ValueError(f"tool.grousers.spin: got {short(spin)} under a load; {remedy}")
+        raise ValueError(f"tool.grousers.spin: got {spin} under a load; {remedy}")
     soil, slip = soil_of(wheel), concrete(slip_of(wheel))
     check_soil(soil)
     if slip is not None and not (slip.ndim == 0 and 0 <= slip <= 1):
