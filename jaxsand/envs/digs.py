@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.envs.excavate import Bed, Excavate, empty
+from jaxsand.envs.excavate import Bed, Excavate
 from jaxsand.envs.heights import Heights
-from jaxsand.envs.library import Level, RandomStrokes, Rough, glyph_square, pool_from, surfaces
+from jaxsand.envs.library import Level, RandomStrokes, Rough, glyph_square, played, pool_from, surfaces
 from jaxsand.envs.multi import LevelGoals, RoughGoals
 from jaxsand.envs.zones import Zones
 from jaxsand.goals import metrics
 from jaxsand.interaction.bucket import bucket_of
+from jaxsand.interaction.load import as_load
 from jaxsand.scene.scene import Scene
 
 _TRIES = 16
@@ -78,13 +79,9 @@ def dug(
     rng = np.random.default_rng(seed)
     plans = [placed(scene, plan) for plan in goals.plans(rng, env.heights)]
     before = surfaces(scene, starts, goals.goals, rng)
-    bed: Bed = (jnp.asarray(before), jax.tree.map(lambda x: jnp.zeros(len(plans), x.dtype), empty(before.dtype)))
-    for k in range(goals.most):
-        digs = np.stack([some[min(k, len(some) - 1)] for some in plans]).astype(np.float32)
-        after = _program(env)(scene, bed, jnp.asarray(digs), zones)
-        due = jnp.array([k < len(some) for some in plans])
-        bed = jax.tree.map(lambda old, new, due=due: jnp.where(due.reshape(-1, *[1] * (old.ndim - 1)), new, old), bed, after)
-    return pool_from(starts, before, np.asarray(bed[0]))
+    empty = jax.tree.map(lambda x: jnp.zeros(len(plans), x.dtype), as_load(None, before.dtype))
+    after, _ = played(lambda bed, digs: _program(env)(scene, bed, digs, zones), (jnp.asarray(before), empty), plans)
+    return pool_from(starts, before, np.asarray(after))
 
 
 def placed(scene: Scene, plan: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from jaxsand.envs.spaces import Box, Dict
 from jaxsand.envs.zones import NoZones, Told, Zones, kept
 from jaxsand.goals import metrics
 from jaxsand.interaction.bucket import bucket_of, dump, scoop
-from jaxsand.interaction.load import Load
+from jaxsand.interaction.load import Load, as_load
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene
@@ -135,7 +135,7 @@ class Excavate:
     def reset(self, key: jax.Array, params: ExcavateParams) -> tuple[dict[str, jax.Array], ExcavateState]:
         """Begins an episode with an empty bucket; returns its first observation and its state."""
         start, goal = params.goals.draw(key)
-        state = ExcavateState(goal, start, empty(start.dtype), jnp.zeros((), jnp.int32))
+        state = ExcavateState(goal, start, as_load(None, start.dtype), jnp.zeros((), jnp.int32))
         return self.observe(state, params), state
 
     def step_env(
@@ -208,11 +208,6 @@ class Excavate:
         """The space of observations."""
         maps = {name: Box(-jnp.inf, jnp.inf, params.scene.grid.shape) for name in ("goal", "current")}
         return Dict(maps | {"load": Box(0, 1, ())})
-
-
-def empty(dtype: jax.typing.DTypeLike) -> Load:
-    """What an empty bucket holds."""
-    return Load(jnp.zeros((), dtype), jnp.zeros((), dtype))
 
 
 @cache

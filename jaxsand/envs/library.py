@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,8 @@ from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene, blade_of
+
+Tree = TypeVar("Tree")
 
 _TRIES = 16
 _GLYPH_MAP = 0.32  # m: the side of the map that the glyphs' square is given for
@@ -169,15 +171,28 @@ def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.nda
     """The maps [G, H, W] (m) after the strokes of each plan: [n, 4] of the unit square, or [n, 6] with heights in depths."""
     depth, square = float(blade_of(scene).depth), glyph_square(scene)
     push, around = _program(env), NoZones() if zones is None else zones
-    heights = jnp.asarray(maps)
+
+    def placed(strokes: np.ndarray) -> np.ndarray:
+        ends = strokes.reshape(len(strokes), 2, -1)
+        metres = np.concatenate([metrics.place(ends[..., :2], square), ends[..., 2:] * depth], axis=2)
+        return metres.reshape(len(strokes), -1)
+
+    after = played(lambda maps, strokes: push(scene, maps, strokes, around), jnp.asarray(maps), list(map(placed, plans)))
+    return np.asarray(after)
+
+
+def played(act: Callable[[Tree, jax.Array], Tree], before: Tree, plans: list[np.ndarray]) -> Tree:
+    """What the actions [n, k] of each plan leave, one after the other; `act` takes one action for each of a batch."""
     for k in range(max(map(len, plans))):
-        ends = np.stack([some[min(k, len(some) - 1)].reshape(2, -1) for some in plans])
-        placed = np.concatenate([metrics.place(ends[..., :2], square), ends[..., 2:] * depth], axis=2)
-        strokes = placed.reshape(len(plans), -1).astype(np.float32)
-        after = push(scene, heights, jnp.asarray(strokes), around)
-        due = jnp.array([k < len(some) for some in plans])
-        heights = jnp.where(due[:, None, None], after, heights)
-    return np.asarray(heights)
+        actions = np.stack([some[min(k, len(some) - 1)] for some in plans]).astype(np.float32)
+        after = act(before, jnp.asarray(actions))
+        due = np.array([k < len(some) for some in plans])
+
+        def kept(old: jax.Array, new: jax.Array, due: np.ndarray = due) -> jax.Array:
+            return jnp.where(due.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        before = jax.tree.map(kept, before, after)
+    return before
 
 
 def glyph_square(scene: Scene) -> tuple[float, float]:

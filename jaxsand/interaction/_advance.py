@@ -141,8 +141,8 @@ class Advance(Step):
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
         lost = self.block.lose(way, view, sand.lost, gone)
         out = Moving(self.block.back(way, view, sand.height, new), lost, after, edge, scooped)
-        others = (way.room, way.base)
-        if self.block.drains or way.drop.ndim == sand.height.ndim or any(other is not None for other in others):
+        by_jax = self.block.drains or way.room is not None or way.base is not None
+        if by_jax or way.drop.ndim == sand.height.ndim:
             return out, sand
         return out, (jnp.where(at(view.holds) > 0, old, jnp.nan), flux)
 

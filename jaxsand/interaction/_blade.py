@@ -181,8 +181,16 @@ def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.A
     """
     # New ghost cells store the footprint, which XLA would else compute anew for both ends of every link.
     free = (1 - outer(inner(reach.after))) * holds
-    out = []
     planes = [(reach.along, reach.beside), *(() if reach.plates is None else (reach.plates,))]
+    return free, lax.optimization_barrier(narrowed(neighbours, free, planes))
+
+
+def narrowed(neighbours: Neighbours, free: jax.Array, planes: list[tuple[jax.Array, jax.Array]]) -> Fluxes:
+    """The open share of each link, from that of cells and from planes that cut links; all maps have ghost cells.
+
+    A plane is known by the distance of each cell from it and by how much of the cell it closes.
+    """
+    out = []
     of_planes = [
         zip(both_ends(neighbours, lax.stop_gradient(way)), both_ends(neighbours, wide), strict=True) for way, wide in planes
     ]
@@ -192,7 +200,7 @@ def gates(neighbours: Neighbours, reach: Reach, holds: jax.Array) -> tuple[jax.A
         for (behind, before), wide in cuts:
             narrow = jnp.where(behind * before < 0, jnp.minimum(narrow, 1 - jnp.minimum(*wide)), narrow)
         out.append(narrow * (2 * high / jnp.maximum(low + high, _LEAST)))
-    return free, lax.optimization_barrier(tuple(out))
+    return tuple(out)
 
 
 def onward(cos: jax.Array, sin: jax.Array, room: jax.Array) -> Shares:

@@ -17,7 +17,7 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Around, flows
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo
+from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, stored
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 
@@ -99,7 +99,7 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
         gain, excess, tilt, lift, moved = carry
         s = halo(lax.dynamic_index_in_dim(tape, sweeps - 1 - j, keepdims=False))
         rises = flux_adjoint.steps(bed, s)
-        passed = flux_adjoint.stored(
+        passed = stored(
             [
                 jnp.where(jnp.abs(d) > m, y, 0)
                 for d, m, y in zip(rises, most, flux_adjoint.steps(bed, halo(gain, 0.0)), strict=True)

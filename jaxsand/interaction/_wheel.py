@@ -21,7 +21,7 @@ from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._block import Block, First, View, Way
 from jaxsand.interaction._frame import Frame
 from jaxsand.interaction.resting import Sand
-from jaxsand.interaction.stencil import both_ends, inner, outer, seen, spread
+from jaxsand.interaction.stencil import inner, outer, seen, spread
 from jaxsand.relaxation.flux import NARROW, Fluxes
 from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.grid import Neighbours
@@ -30,7 +30,6 @@ _TOUCH = 0.25  # spacings below the rim at which the wheel begins to touch sand
 _PASSES = 4  # cells by which sand under the wheel moves on in a sub-step
 _SLIVER = 0.002  # the smallest open share that is divided by: in a narrower one sand stands as high as in this
 _ASIDE = 0.5  # sideways part of the displacement at the rim's two edges, over the part ahead
-_LEAST = 1e-4
 _FOUR = ((0, 1), (0, -1), (1, 0), (-1, 0))
 Shares = tuple[jax.Array, ...]  # of the four straight neighbours, with ghost cells
 
@@ -258,18 +257,8 @@ def _gates(neighbours: Neighbours, wheel: Stand, touch: jax.Array, holds: jax.Ar
         (wheel.aside, wheel.lengthwise * touch),  # across which the flanks part sand
         (wheel.along, wheel.crosswise * touch),  # and the rim
     ]
-    planes = [
-        zip(both_ends(neighbours, outer(lax.stop_gradient(way))), both_ends(neighbours, outer(wall)), strict=True)
-        for way, wall in walls
-    ]
-    out = []
-    for (here, there), *cuts in zip(both_ends(neighbours, outer(free)), *planes, strict=True):
-        low, high = jnp.minimum(here, there), jnp.maximum(here, there)
-        narrow = low
-        for (behind, before), (one, other) in cuts:
-            narrow = jnp.where(behind * before < 0, jnp.minimum(narrow, 1 - jnp.minimum(one, other)), narrow)
-        out.append(narrow * (2 * high / jnp.maximum(low + high, _LEAST)))
-    return free, lax.optimization_barrier(tuple(out))
+    planes = [(outer(way), outer(wall)) for way, wall in walls]
+    return free, lax.optimization_barrier(blade.narrowed(neighbours, outer(free), planes))
 
 
 def carried_back(

@@ -5,15 +5,13 @@ T_i / O_i. So the sand never comes to lie below the floor, and since what a link
 """
 
 from collections.abc import Sequence
-from itertools import accumulate
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsand.relaxation.flux import Fluxes, ends
-from jaxsand.relaxation.ghost_cells import halo, truncate
+from jaxsand.relaxation.flux import Fluxes, ends, of_cells
+from jaxsand.relaxation.ghost_cells import halo, stored, truncate
 from jaxsand.scene.grid import Neighbours, links
 
 _LESS = 1 - 2.0**-20  # so that the rounded products of shares and fluxes never sum to more than there is
@@ -29,12 +27,9 @@ def no_more_than(neighbours: Neighbours, there: Float[Array, "H W ..."], moved: 
 
     All are whole quanta; fluxes over links are positive towards the link's first cell.
     """
-    moved = _stored(moved)
+    moved = stored(moved)
     given = sum(moved[len(links(neighbours)) :], jnp.zeros_like(there))
-    for (di, dj, _), f in zip(links(neighbours), moved, strict=False):
-        rows, columns = f.shape[:2]
-        first, second = f[:, max(dj, 0) : columns + min(dj, 0)], f[:, max(-dj, 0) : columns - max(dj, 0)]
-        first, second = first[di:], second[: rows - di]
+    for first, second in of_cells(neighbours, moved):
         given = given + (jnp.where(second > 0, second, 0) - jnp.where(first < 0, first, 0))
     short = given > there
     share = jnp.where(short, there / jnp.where(short, given, 1) * _LESS, 1)
@@ -43,15 +38,3 @@ def no_more_than(neighbours: Neighbours, there: Float[Array, "H W ..."], moved: 
         here, beyond = ends(around, di, dj)
         out.append(truncate(f * jnp.where(f > 0, beyond, here)))
     return (*out, *(truncate(f * share) for f in moved[len(out) :]))
-
-
-def _stored(maps: Sequence[jax.Array]) -> list[jax.Array]:
-    """The same maps, computed once and stored as one array; XLA would else compute them anew for each neighbour."""
-    most = max(x.shape[1] for x in maps)
-
-    def wide(x: jax.Array) -> jax.Array:
-        return lax.concatenate([x, jnp.zeros((x.shape[0], most - x.shape[1], *x.shape[2:]), x.dtype)], 1)
-
-    whole = lax.optimization_barrier(lax.concatenate([wide(x) for x in maps], 0))
-    stops = accumulate(x.shape[0] for x in maps)
-    return [whole[stop - x.shape[0] : stop, : x.shape[1]] for stop, x in zip(stops, maps, strict=True)]

@@ -21,7 +21,7 @@ edge count too: the maps are [H, W + 1] along x, [H + 1, W] along y, and [H + 1,
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,11 +115,17 @@ def gained(bed: Bed, flow: Fluxes) -> Float[Array, "H W"]:
 def received(neighbours: Neighbours, flow: Fluxes) -> Float[Array, "H W ..."]:
     """What each cell receives over its links, less what it gives."""
     net = jnp.zeros((), flow[0].dtype)
+    for first, second in of_cells(neighbours, flow):
+        net = net + (first - second)
+    return net
+
+
+def of_cells(neighbours: Neighbours, flow: Sequence[jax.Array]) -> Iterator[tuple[jax.Array, jax.Array]]:
+    """For each direction, the fluxes [H, W] over the link whose first cell a cell is, and over that whose second it is."""
     for (di, dj, _), f in zip(links(neighbours), flow, strict=False):
         rows, columns = f.shape[:2]
-        right, left = f[:, max(dj, 0) : columns + min(dj, 0)], f[:, max(-dj, 0) : columns - max(dj, 0)]
-        net = net + (right[di:] - left[: rows - di])
-    return net
+        first, second = f[:, max(dj, 0) : columns + min(dj, 0)], f[:, max(-dj, 0) : columns - max(dj, 0)]
+        yield first[di:], second[: rows - di]
 
 
 def fluxes_zero(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Fluxes:

@@ -16,7 +16,6 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsand.relaxation.ghost_cells import Bed, halo
@@ -43,13 +42,6 @@ def pairs(bed: Bed, u: Ghosted) -> list[tuple[OnLattice, OnLattice]]:
 def steps(bed: Bed, u: Ghosted) -> Lattice:
     """The step over every link, from its first to its second cell."""
     return tuple(there - here for here, there in pairs(bed, u))
-
-
-def stored(flow: list[jax.Array]) -> list[jax.Array]:
-    """The same maps, computed once and stored; XLA would else compute them anew wherever they are used."""
-    both = lax.optimization_barrier(lax.concatenate(flow, 0))
-    rows = flow[0].shape[0]
-    return [both[k * rows : (k + 1) * rows] for k in range(len(flow))]
 
 
 def gains(bed: Bed, flow: Lattice) -> Float[Array, "H W"]:

@@ -7,7 +7,9 @@ where heights are multiples of the quantum, and rounding errors do not build up 
 cut.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 
 import jax
 import jax.numpy as jnp
@@ -211,3 +213,16 @@ def at(u: Float[Array, "H+2 W+2 ..."], di: int = 0, dj: int = 0) -> Float[Array,
     """The value di rows and dj columns further, for each inner cell of a map with ghost cells; (0, 0) drops the ghosts."""
     rows, columns = u.shape[0] - 2, u.shape[1] - 2
     return u[1 + di : 1 + di + rows, 1 + dj : 1 + dj + columns]
+
+
+def stored(maps: Sequence[jax.Array]) -> list[jax.Array]:
+    """The same maps, computed once and stored as one array; XLA would else compute them anew wherever they are used."""
+    most = max(x.shape[1] for x in maps)
+
+    def wide(x: jax.Array) -> jax.Array:
+        more = most - x.shape[1]
+        return lax.concatenate([x, jnp.zeros((x.shape[0], more, *x.shape[2:]), x.dtype)], 1) if more else x
+
+    whole = lax.optimization_barrier(lax.concatenate([wide(x) for x in maps], 0))
+    stops = accumulate(x.shape[0] for x in maps)
+    return [whole[stop - x.shape[0] : stop, : x.shape[1]] for stop, x in zip(stops, maps, strict=True)]

@@ -126,7 +126,7 @@ def _varied(job: Job, plan: np.ndarray, budget: float, rng: np.random.Generator)
     if budget < 2 * count:  # the plan itself, and one variant of its first stroke
         return plan, effort
     way = finish(job.scene, plan[None], 0, job.height[None])[:, 0]
-    effort, left, turn = Effort(full=count), distance(way[-1], job.goal), 0
+    effort, left = Effort(full=count), distance(way[-1], job.goal)
     while True:
         k = int(rng.integers(count))
         some = min(_VARIANTS, int((budget - effort.cost) / (count - k)))
@@ -140,7 +140,6 @@ def _varied(job: Job, plan: np.ndarray, budget: float, rng: np.random.Generator)
         best = int(ends.argmin())
         if ends[best] < left:
             left, plan, way = ends[best], tried[best], np.concatenate([way[:k], maps[:, best]])
-        turn += 1
     return plan[: int(distance(way, job.goal).argmin())], effort
 
 
