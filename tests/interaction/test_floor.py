@@ -79,7 +79,7 @@ def test_a_floor_deeper_than_the_tool_changes_nothing():
 def random_action(scene, rng, height, load):
     """The map and the load after an action of any kind."""
     kind, path = rng.integers(6), np.column_stack([rng.uniform(0.0, 0.2, (2, 2)), rng.uniform(-0.07, 0.02, 2)])
-    stroke, load_scene = path.ravel(), on(scene.base.height, js.Bucket(0.05, 0.04, 1e-4))
+    stroke, load_scene = path.ravel(), on(scene.base.height, js.Bucket(0.05, 0.04, 1e-4, walls=0.03))
     if kind == 0:
         return js.step(on(scene.base.height, js.Blade(0.06, 0.02)), height, stroke), load
     if kind == 1:
@@ -94,11 +94,20 @@ def random_action(scene, rng, height, load):
     return out, out.load
 
 
-@pytest.mark.parametrize(("count", "most"), [(24, 1e-8), pytest.param(10_000, 1e-7, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("dtype", ["float32"])
-def test_mixed_actions_keep_volume_and_floor(count, most, dtype):
+FEW, MANY = 24, 10_000
+
+
+@pytest.mark.parametrize(
+    ("dtype", "count", "most"),
+    [
+        ("float32", FEW, 1e-8),
+        pytest.param("float32", MANY, 1e-7, marks=pytest.mark.slow),
+        pytest.param("float64", MANY, 1e-14, marks=pytest.mark.slow),
+    ],
+)
+def test_mixed_actions_keep_volume_and_floor(dtype, count, most):
     rock = (rough(4, 0.08) - 0.08).astype(dtype)
-    scene = on(rock, js.Bucket(0.05, 0.04, 1e-4))
+    scene = on(rock, js.Bucket(0.05, 0.04, 1e-4, walls=0.03))
     height, load = jnp.asarray(np.maximum(rough(6, 0.05).astype(dtype) - np.float32(0.05), rock)), None
     height = js.settle(scene, height).height
     rng, worth = np.random.default_rng(8), DX**2 * np.sum(np.asarray(height, float) - rock)
