@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxsand.envs import make as make
+    from jaxsand.goals.goal import Goal as Goal
     from jaxsand.interaction._path import Pushed as Pushed
     from jaxsand.interaction.batched import step_batch as step_batch
     from jaxsand.interaction.batched import value_and_grad_batch as value_and_grad_batch
@@ -104,6 +105,7 @@ _HOMES = {
     "Deep": "scene.boundaries",
     "Draining": "scene.boundaries",
     "Flat": "planning.search.actions",
+    "Goal": "goals.goal",
     "Grid": "scene.grid",
     "Grousers": "scene.tools",
     "Heaped": "interaction.load",

@@ -24,7 +24,7 @@ from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.planning.search import plan_sand
-from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.planning.stroke_loss import SandLoss, sand_loss
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -127,7 +127,7 @@ def compare(
         figures, began = [], time.perf_counter()
         for goal in goals:
             tell(f"{name}: {goal.name}")
-            sand = SandLoss(goal.scene, np.zeros(_SHAPE, np.float32), goal.goal)
+            sand = sand_loss(goal.scene, np.zeros(_SHAPE, np.float32), goal.goal)
             plan = find(sand)
             height = sand.maps(plan[None])[0] if len(plan) else sand.start
             figures.append(judged(goal, height) | {"strokes": float(len(plan))})

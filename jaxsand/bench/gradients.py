@@ -24,7 +24,7 @@ from jaxsand.bench.gradient_checks import (
 )
 from jaxsand.bench.timing import race
 from jaxsand.interaction.stepped import SteppedPush
-from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
+from jaxsand.planning.stroke_loss import GRADIENT, sand_loss
 from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
 from jaxsand.scene.boundaries import Base
 from jaxsand.scene.progress import Tell, quiet
@@ -203,7 +203,7 @@ def multiples(tell: Tell, plans: tuple[int, ...], strokes: int = 3, cells: int =
     """Times the way forward that the way back takes in `SandLoss.gradient`, for plans of random strokes on level sand; best
     of a few. `counted` is what a search is charged for it."""
     level = np.zeros((cells, cells), np.float32)
-    loss = SandLoss(make_scene(level.shape, SPACING, tool=Blade()), level, level)
+    loss = sand_loss(make_scene(level.shape, SPACING, tool=Blade()), level, level)
     rows = []
     for count in plans:
         tell(f"{count} plans of {strokes} strokes")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.goals.metrics import still_to_do
+from jaxsand.goals.goal import Goal
 from jaxsand.goals.surfaces import rough_surface
 from jaxsand.interaction.outcome import check
 from jaxsand.planning.gradient import optimise_strokes
@@ -46,8 +46,8 @@ class Work:
 
     def error(self, height: np.ndarray) -> float:
         """The mean |height - goal| (mm) where the goal counts."""
-        off = still_to_do(height, self.goal)
-        return float(1e3 * np.abs(off).sum() / np.isfinite(self.goal).sum())
+        goal = Goal(self.goal, power=1)
+        return float(1e3 * goal.cost(np.asarray(height, float)) / np.isfinite(self.goal).sum())
 
 
 def ramp(name: str, level: float, depth: float, trial: dict[str, float]) -> Work:

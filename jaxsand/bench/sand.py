@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxsand.bench.rivals import search
 from jaxsand.bench.timing import race
+from jaxsand.goals.goal import as_goal
 from jaxsand.interaction.simulate import step
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Job, Lattice, Steps, propose
@@ -51,7 +52,8 @@ def children_per_second(batch: int = 256, alone: int = 32, seed: int = 0) -> lis
     """Children of one node: in batches, in full and roughly, and by the same push one at a time in a Python loop."""
     chosen = sand_task("crossing")
     scene, level = chosen.scene, chosen.height
-    ways = propose(scene, Lattice(), level, chosen.goal, batch, np.random.default_rng(seed)).astype(np.float32)
+    goal = as_goal(scene, chosen.goal)
+    ways = propose(scene, Lattice(), level, goal, batch, np.random.default_rng(seed)).astype(np.float32)
     maps = np.repeat(level[None], batch, axis=0)
     one = jax.jit(partial(step, scene))
 
@@ -74,7 +76,7 @@ def children_per_second(batch: int = 256, alone: int = 32, seed: int = 0) -> lis
 
 
 def _on_task(chosen: SandTask, tell: Tell, per_stroke: int, seed: int) -> list[dict[str, Any]]:
-    scene, height, goal = chosen.scene, chosen.height, chosen.goal
+    scene, height, goal = chosen.scene, chosen.height, as_goal(chosen.scene, chosen.goal)
     job, budget = Job(scene, height, goal, chosen.strokes, chosen.actions), per_stroke * chosen.strokes
     before = float(distance(height, goal))
     tell(f"{chosen.name}: {_SEARCH}")

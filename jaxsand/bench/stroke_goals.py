@@ -12,7 +12,7 @@ from jaxsand.goals.surfaces import terrain_surface
 from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import rollout
-from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.planning.stroke_loss import SandLoss, sand_loss
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import Scene, make_scene
@@ -34,7 +34,7 @@ class StrokeGoal:
     @property
     def sand(self) -> SandLoss:
         """How far plans end from the goal."""
-        return SandLoss(self.scene, self.start, self.goal)
+        return sand_loss(self.scene, self.start, self.goal)
 
     @property
     def depth(self) -> float:

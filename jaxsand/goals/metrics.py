@@ -311,26 +311,6 @@ def fits_where_it_counts(scene: Scene, goal: np.ndarray, name: str = "goal") -> 
     fits(scene, np.where(np.isnan(goal), 0, goal), name)
 
 
-def still_to_do(height: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """The surplus of sand, height - goal, and 0 where the goal is free (NaN).
-
-    Args:
-      height: [..., H, W] (m).
-      goal: [H, W] (m), NaN where any height will do.
-
-    Returns:
-      [..., H, W] (m). A height that is not finite stays so.
-
-    Example:
-      >>> import numpy as np
-      >>> import jaxsand as js
-      >>> js.task.still_to_do(np.array([[0.5, 0.5]]), np.array([[0.25, np.nan]])).tolist()
-      [[0.25, 0.0]]
-    """
-    goal = np.asarray(goal, float)
-    return np.where(np.isnan(goal), 0 * np.asarray(height, float), height - goal)
-
-
 def finite(goal: np.ndarray, name: str = "goal") -> None:
     """Checks that every cell of a goal is finite and none is masked.
 

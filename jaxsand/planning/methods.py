@@ -10,7 +10,7 @@ from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Planned, Stages, plan_by_policy
 from jaxsand.planning.pipeline import Target, at_rest
 from jaxsand.planning.search import SandPlan, plan_sand
-from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.progress import Tell
 
 
@@ -36,7 +36,7 @@ def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pu
 
 def by_policy(target: Target, before: np.ndarray | None, strokes: int, stages: Stages, tell: Tell) -> Target:
     """The target with at most `strokes` strokes of the policy, improved by the stages that follow it."""
-    sand = SandLoss(target.scene, at_rest(target.scene, before, tell), target.goal.astype(np.float32))
+    sand = sand_loss(target.scene, at_rest(target.scene, before, tell), target.goal.astype(np.float32))
     found = plan_by_policy(load_policy(), sand, strokes, stages, tell)
     return _by("policy", target, found, found.strokes.reshape(-1, 2, 2))
 

@@ -10,8 +10,10 @@ from typing import Protocol
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
-from jaxsand.goals.metrics import fits, fits_where_it_counts, still_to_do
+from jaxsand.goals.goal import Goal, as_goal
+from jaxsand.goals.metrics import fits
 from jaxsand.interaction.batched import step_batch, value_and_grad_batch
 from jaxsand.scene.scene import Scene
 
@@ -20,7 +22,7 @@ GRADIENT = 4
 
 
 Weigh = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""From differences [P, H, W] (m) to a loss of them [P] and its gradient [P, H, W]."""
+"""From the residuals of a goal [P, H, W] to a loss of them [P] and its gradient by them [P, H, W]."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Best:
 
     Attributes:
       calls: how many calls of the simulator it took to find it.
-      loss: squared distance (m^2) from the goal.
+      loss: its cost, which is the squared distance (m^2) from a goal of squares.
       strokes: [N, 4] (m).
     """
 
@@ -54,21 +56,18 @@ class Evaluate(Protocol):
 
 @dataclass(frozen=True)
 class SandLoss:
-    """The squared l2 distance (m^2) between the goal and what a plan leaves; infinite where an outcome is not clean.
+    """What a plan's result costs by the goal: the squared l2 distance (m^2), if all cells count alike; infinite where an
+    outcome is not clean.
 
     Args:
       scene: grid, sand and blade.
       start: the map [H, W] (m) before the first stroke, at rest.
-      goal: [H, W] (m), NaN where it is free.
+      goal: what is wanted, as `as_goal` makes it; `sand_loss` takes a user's.
     """
 
     scene: Scene
     start: np.ndarray
-    goal: np.ndarray
-
-    def __post_init__(self) -> None:
-        fits(self.scene, self.start, "start")
-        fits_where_it_counts(self.scene, self.goal)
+    goal: Goal
 
     def __call__(self, candidates: np.ndarray) -> np.ndarray:
         """The losses [P] of plans [P, N, 4] (m)."""
@@ -93,7 +92,7 @@ class SandLoss:
 
         Args:
           candidates: plans [P, N, 4] (m).
-          weigh: from the differences maps - goal [P, H, W] to the loss [P] and its gradient by them [P, H, W].
+          weigh: from the goal's residuals of the maps [P, H, W] to the loss [P] and its gradient by them [P, H, W].
 
         Returns:
           The loss [P], infinite where an outcome is not clean, and its gradient [P, N, 4] by the plans, NaN there.
@@ -101,7 +100,9 @@ class SandLoss:
         maps = [np.repeat(self.start[None].astype(np.float32), len(candidates), axis=0)]
         for k in range(candidates.shape[1]):
             maps.append(pushed(self.scene, maps[-1], candidates[:, k]))
-        value, back = weigh(still_to_do(maps[-1].astype(float), self.goal))
+        residual, rate = self.goal.residual(maps[-1].astype(float))
+        value, back = weigh(residual)
+        back = back * rate
         out = np.zeros(candidates.shape)
         for k in reversed(range(candidates.shape[1])):
             back, out[:, k] = _pulled(self.scene, maps[k], candidates[:, k], back)
@@ -117,8 +118,12 @@ class SandLoss:
 
     @property
     def target(self) -> np.ndarray:
-        """The goal [H, W] (m), and the start's own height where the goal is free."""
-        return np.where(np.isnan(self.goal), self.start, self.goal)
+        """The map [H, W] (m) nearest to the start that costs nothing."""
+        return self.nearest(self.start)
+
+    def nearest(self, height: np.ndarray) -> np.ndarray:
+        """The map [H, W] (m) nearest to a map that costs nothing."""
+        return np.asarray(height - self.goal.off(height.astype(float)), np.float32)
 
     def inside(self, plans: np.ndarray) -> np.ndarray:
         """Plans [..., 4] or [..., 6] with every stroke moved onto the map; heights stay as they are."""
@@ -130,12 +135,22 @@ class SandLoss:
         return np.clip(plans, low, high)
 
     def loss_of(self, height: np.ndarray) -> float:
-        """The squared distance (m^2) of a map [H, W] (m) from the goal."""
+        """The cost of a map [H, W] (m)."""
         return float(self._loss(height))
 
     def _loss(self, maps: np.ndarray) -> np.ndarray:
-        square = (still_to_do(maps.astype(float), self.goal) ** 2).sum((-2, -1))
-        return np.where(np.isnan(square), np.inf, square)
+        cost = self.goal.cost(maps.astype(float))
+        return np.where(np.isnan(cost), np.inf, cost)
+
+
+def sand_loss(scene: Scene, start: np.ndarray, goal: Goal | ArrayLike) -> SandLoss:
+    """What plans that begin on the map `start` [H, W] (m), at rest, cost by a goal.
+
+    Raises:
+      ValueError: if the start or the goal does not fit the scene.
+    """
+    fits(scene, start, "start")
+    return SandLoss(scene, start, as_goal(scene, goal))
 
 
 def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from jaxsand.bench.rivals.strokes import RIVALS, random_shooting
 from jaxsand.bench.stroke_goals import letters_on_rough_sand, many_strokes, stroke_goal, turned_letters
 from jaxsand.bench.strokes import reached, run_all
 from jaxsand.interaction.simulate import rollout
-from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.relaxation.stopping import Outcome
 from jaxsand.scene.window import Window
 from jaxsand.viz.strokes import strokes_figure
@@ -90,7 +90,7 @@ def bar():
 
 
 def test_many_plans_at_once_leave_what_the_simulator_leaves(bar):
-    loss = SandLoss(bar.scene, bar.start, bar.goal)
+    loss = sand_loss(bar.scene, bar.start, bar.goal)
     low, high = loss.bounds
     plans = low + np.random.default_rng(0).random((5, 2, 4)) * (high - low)
     plans[0] = bar.strokes
@@ -108,12 +108,12 @@ def test_a_push_that_touches_its_window_is_pushed_again_on_the_whole_map(bar, mo
     small = replace(bar.scene, window=Window((6, 6)))
     assert int(js.step_batch(small, bar.start[None], bar.strokes[:1]).outcome[0]) == Outcome.WINDOW_EDGE
     monkeypatch.setattr("jaxsand.interaction.batched.windows_for", lambda *_: [small])
-    after = SandLoss(bar.scene, bar.start, bar.goal).maps(bar.strokes[None])[0]
+    after = sand_loss(bar.scene, bar.start, bar.goal).maps(bar.strokes[None])[0]
     np.testing.assert_allclose(after, bar.goal, atol=5e-7)
 
 
 def test_a_plan_that_is_not_finite_is_infinitely_far(bar):
-    loss = SandLoss(bar.scene, bar.start, bar.goal)
+    loss = sand_loss(bar.scene, bar.start, bar.goal)
     assert np.isinf(loss(np.full((1, 2, 4), np.nan)))[0]
 
 
@@ -191,4 +191,4 @@ def test_goals_of_other_kinds():
 
 def test_a_goal_of_another_shape_is_refused(bar):
     with pytest.raises(ValueError, match="start: got shape"):
-        SandLoss(bar.scene, bar.start[:4], bar.goal)
+        sand_loss(bar.scene, bar.start[:4], bar.goal)

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxsand.bench.stroke_goals import letters
 from jaxsand.goals.layout import right, strict, strokes_right
-from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.tools import Blade
 
 DEPTH = float(Blade().depth)
@@ -12,7 +12,7 @@ E = letters("E")[0]  # four strokes
 
 
 def left(strokes):
-    return SandLoss(E.scene, E.start, E.goal).maps(np.asarray(strokes, np.float32)[None])[0]
+    return sand_loss(E.scene, E.start, E.goal).maps(np.asarray(strokes, np.float32)[None])[0]
 
 
 def test_the_goal_itself_is_right_and_strict_and_level_sand_is_not():

@@ -8,11 +8,11 @@ import pytest
 from jaxsand.bench.stroke_goals import letters
 from jaxsand.planning.learned.beam_search import look_ahead, most_calls, one_after_the_other, put_right
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
-from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.scene import Scene, make_scene
 
 F = letters("F")[0]  # three strokes
-SAND = SandLoss(F.scene, F.start, F.goal)
+SAND = sand_loss(F.scene, F.start, F.goal)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def test_where_a_loss_only_falls_ends_go_the_whole_way_but_not_off_the_map():
 
 
 def test_nothing_is_done_where_nothing_helps():
-    done = SandLoss(F.scene, F.goal, F.goal)
+    done = sand_loss(F.scene, F.goal, F.goal)
     found = look_ahead(Always(F.strokes), done, 3, width=2)
     assert found.strokes.shape == (0, 4)
     assert found.losses.tolist() == [0.0]

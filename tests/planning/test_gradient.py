@@ -13,7 +13,7 @@ from jaxsand.planning.gradient import as_many_as_pay, print_of, search
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import Plans, reordered
 from jaxsand.planning.gradient.sketch import guesses, printed, prints
-from jaxsand.planning.stroke_loss import GRADIENT, SandLoss
+from jaxsand.planning.stroke_loss import GRADIENT, sand_loss
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def tee():
 
 
 def account(goal, budget):
-    return Account(SandLoss(goal.scene, goal.start, goal.goal), budget)
+    return Account(sand_loss(goal.scene, goal.start, goal.goal), budget)
 
 
 def test_a_print_is_its_stroke_wherever_it_is_moved(bar):

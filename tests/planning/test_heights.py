@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.goals.metrics import fits_where_it_counts, still_to_do
+from jaxsand.goals.goal import Goal, as_goal
+from jaxsand.goals.metrics import fits_where_it_counts
 from jaxsand.planning.search import rollouts
 from jaxsand.planning.search.actions import Job
 from jaxsand.planning.search.heights import around, propose_heights, search_heights, within
 from jaxsand.planning.search.reach import volume_distance
 from jaxsand.planning.search.rollouts import distance, replay
-from jaxsand.planning.stroke_loss import SandLoss
+from jaxsand.planning.stroke_loss import sand_loss
 
 SHAPE = (12, 20)
 SCENE = js.make_scene(SHAPE, 0.02, tool=js.Blade(width=0.1, thickness=0.03, depth=0.0))
@@ -20,6 +21,7 @@ LEVEL = np.zeros(SHAPE, np.float32)
 X, Y = np.meshgrid((np.arange(20) + 0.5) * 0.02, (np.arange(12) + 0.5) * 0.02)
 INSIDE = (X > 0.08) & (X < 0.3) & (Y > 0.06) & (Y < 0.16)
 RAMP = np.where(INSIDE, 0.2 * (X - 0.19), np.nan)
+WANTED = as_goal(SCENE, RAMP)
 BUDGET = 120
 
 
@@ -30,7 +32,7 @@ def found():
 
 def test_a_plan_with_heights_replayed_leaves_what_it_says(found):
     np.testing.assert_array_equal(replay(SCENE, LEVEL, found.paths), found.height)
-    assert float(distance(found.height, RAMP)) == found.after
+    assert float(distance(found.height, WANTED)) == found.after
     assert all(path.shape == (2, 3) for path in found.paths)
     assert found.strokes.shape == (len(found.paths), 6)
     assert 0.9 * BUDGET < found.effort.cost <= BUDGET
@@ -78,7 +80,7 @@ def test_a_search_with_heights_costs_no_more_than_its_budget(monkeypatch, budget
     monkeypatch.setattr(rollouts, "step_batch", step_batch)
     for strokes in (1, 2, 6):
         pushes.clear()
-        job = Job(SCENE, LEVEL, RAMP, strokes, js.Rising())
+        job = Job(SCENE, LEVEL, WANTED, strokes, js.Rising())
         found, effort = search_heights(job, budget, np.random.default_rng(1))
         assert effort.full == sum(pushes) <= budget
         assert effort.full > budget - 2 * strokes - 1
@@ -90,7 +92,7 @@ def test_a_search_with_heights_costs_no_more_than_its_budget(monkeypatch, budget
 )
 def test_strokes_keep_to_the_map_and_to_what_is_allowed(actions):
     rng = np.random.default_rng(0)
-    job = Job(SCENE, LEVEL, RAMP, 1, actions)
+    job = Job(SCENE, LEVEL, WANTED, 1, actions)
     drawn = propose_heights(job, LEVEL, 97, rng)
     near = around(job, LEVEL, drawn, 50, 3.0, rng)
     still = within(job, np.array([[0.2, 0.1, 0.0, 0.2, 0.1, 0.0]]))
@@ -115,7 +117,9 @@ def test_strokes_are_drawn_towards_where_sand_is_wanted():
     goal = np.zeros(SHAPE)
     height = LEVEL.copy()
     height[6, 3], goal[6, 16] = 0.01, 0.01
-    drawn = propose_heights(Job(SCENE, height, goal, 1, js.Rising(longest=30.0)), height, 400, np.random.default_rng(0))
+    drawn = propose_heights(
+        Job(SCENE, height, as_goal(SCENE, goal), 1, js.Rising(longest=30.0)), height, 400, np.random.default_rng(0)
+    )
     from_heap = np.hypot(drawn[:, 0] - 0.07, drawn[:, 1] - 0.13) < 0.06
     to_hole = np.hypot(drawn[:, 3] - 0.33, drawn[:, 4] - 0.13) < 0.06
     assert 0.08 < np.mean(from_heap & to_hole) < 0.25
@@ -124,23 +128,25 @@ def test_strokes_are_drawn_towards_where_sand_is_wanted():
 def test_strokes_follow_the_slope_that_is_wanted():
     """Half of the strokes run along a plane goal to the last bit of it, wherever their ends are; not where none counts."""
     plane = 0.1 * X - 0.3 * Y
-    drawn = propose_heights(Job(SCENE, LEVEL, plane, 1, js.Rising(shortest=1e-3)), LEVEL, 400, np.random.default_rng(0))
+    drawn = propose_heights(
+        Job(SCENE, LEVEL, as_goal(SCENE, plane), 1, js.Rising(shortest=1e-3)), LEVEL, 400, np.random.default_rng(0)
+    )
     off = np.abs(drawn[:, [2, 5]] - 0.1 * drawn[:, [0, 3]] + 0.3 * drawn[:, [1, 4]]).max(1)
     assert 0.2 < np.mean(off < 1e-9) < 0.5
     nowhere = np.where(X < 0.03, 0.05, np.nan)
-    drawn = propose_heights(Job(SCENE, LEVEL, nowhere, 1, js.Rising()), LEVEL, 400, np.random.default_rng(0))
+    drawn = propose_heights(Job(SCENE, LEVEL, as_goal(SCENE, nowhere), 1, js.Rising()), LEVEL, 400, np.random.default_rng(0))
     assert np.isfinite(drawn).all()
 
 
 def test_free_cells_do_not_count():
     goal = np.full(SHAPE, np.nan)
     goal[2, 3] = 0.004
-    assert distance(LEVEL[None], goal).tolist() == [0.004]
-    assert np.isinf(distance(np.full((1, *SHAPE), np.nan), goal)[0])  # a map that is not clean is no solution
-    assert np.count_nonzero(still_to_do(LEVEL + 1, goal)) == 1
-    assert volume_distance(SCENE, LEVEL, goal) == 0
-    assert volume_distance(SCENE, LEVEL, LEVEL + 0.001) == pytest.approx(0.001 * np.sqrt(240))
-    loss = SandLoss(SCENE, LEVEL, goal)
+    assert distance(LEVEL[None], as_goal(SCENE, goal)).tolist() == [0.004]
+    assert np.isinf(distance(np.full((1, *SHAPE), np.nan), as_goal(SCENE, goal))[0])  # a map that is not clean is no solution
+    assert np.count_nonzero(Goal(goal).off(LEVEL + 1)) == 1
+    assert volume_distance(SCENE, LEVEL, as_goal(SCENE, goal)) == 0
+    assert volume_distance(SCENE, LEVEL, as_goal(SCENE, LEVEL + 0.001)) == pytest.approx(0.001 * np.sqrt(240))
+    loss = sand_loss(SCENE, LEVEL, goal)
     assert loss.loss_of(LEVEL) == pytest.approx(0.004**2)
     assert loss.target[2, 3] == 0.004
     assert np.count_nonzero(loss.target) == 1
@@ -150,12 +156,12 @@ def test_free_cells_do_not_count():
         fits_where_it_counts(SCENE, goal * np.nan)
     masked = np.ma.masked_invalid(RAMP)
     assert js.plan_sand(SCENE, LEVEL, masked, strokes=1, actions=js.Rising(), budget=1).before == float(
-        distance(LEVEL, RAMP)
+        distance(LEVEL, WANTED)
     )
 
 
 def test_plans_stay_on_the_map_and_heights_stay_as_they_are():
-    loss = SandLoss(SCENE, LEVEL, RAMP)
+    loss = sand_loss(SCENE, LEVEL, RAMP)
     np.testing.assert_allclose(loss.inside(np.array([[-1.0, 9, -3, 9, -1, 3]])), [[0.01, 0.23, -3, 0.39, 0.01, 3]])
     np.testing.assert_allclose(loss.inside(np.array([[-1.0, 9, 9, -1]])), [[0.01, 0.23, 0.39, 0.01]])
 

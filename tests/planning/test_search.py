@@ -11,6 +11,7 @@ import pytest
 import jaxsand as js
 from jaxsand.bench.rivals.search import binary, greedy, shooting
 from jaxsand.bench.sand import bench_sand
+from jaxsand.goals.goal import as_goal
 from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search import rollouts
 from jaxsand.planning.search import steps as of_steps
@@ -26,6 +27,7 @@ SCENE = js.make_scene(SHAPE, 0.01, tool=js.Blade())
 LEVEL = np.zeros(SHAPE, np.float32)
 STROKES = np.array([[0.03, 0.05, 0.11, 0.05], [0.03, 0.09, 0.11, 0.09]])
 GOAL = replay(SCENE, LEVEL, [s.reshape(2, 2) for s in STROKES])
+WANTED = as_goal(SCENE, GOAL)
 BUDGET = 200
 
 
@@ -37,10 +39,10 @@ def found():
 def test_a_plan_replayed_leaves_what_it_says(found):
     height = replay(SCENE, LEVEL, found.paths)
     np.testing.assert_array_equal(height, found.height)
-    assert float(distance(height, GOAL)) == found.after
+    assert float(distance(height, WANTED)) == found.after
     rolled = js.rollout(SCENE, jnp.asarray(LEVEL), jnp.asarray(found.strokes, jnp.float32))
-    assert float(distance(np.asarray(rolled.height[-1]), GOAL)) == pytest.approx(found.after, rel=1e-3)
-    assert found.before == float(distance(LEVEL, GOAL))
+    assert float(distance(np.asarray(rolled.height[-1]), WANTED)) == pytest.approx(found.after, rel=1e-3)
+    assert found.before == float(distance(LEVEL, WANTED))
     assert 0 < len(found.paths) <= 2
     assert found.reason is None
 
@@ -82,11 +84,11 @@ def test_a_search_costs_no_more_than_its_budget(monkeypatch, budget):
         rollouts, "settle_batch", lambda _, maps: SimpleNamespace(height=maps, outcome=np.zeros(len(maps), int))
     )
     monkeypatch.setattr(of_steps, "follow_padded", follow_padded)
-    hints = propose(SCENE, js.Lattice(), LEVEL, GOAL, 24, dig)
+    hints = propose(SCENE, js.Lattice(), LEVEL, WANTED, 24, dig)
     for count in (1, 2, 6):
         for hinted in (hints, hints[:0]):
             pushes.update(full=0, rough=0)
-            job = Job(SCENE, LEVEL, GOAL, count, js.Lattice())
+            job = Job(SCENE, LEVEL, WANTED, count, js.Lattice())
             found, effort = of_strokes.search_strokes(job, hinted, budget, np.random.default_rng(1))
             assert (effort.full, effort.rough) == (pushes["full"], pushes["rough"])
             assert effort.full + CHEAP * effort.rough <= budget + 1e-9
@@ -94,7 +96,7 @@ def test_a_search_costs_no_more_than_its_budget(monkeypatch, budget):
             assert effort.cost > min(0.6 * budget, budget - 1.5 * count)  # nor does it leave much of it
         for hint in (np.array([[1, 1], [1, 2], [1, 3], [2, 3]]), np.zeros((0, 2), int)):
             pushes.update(full=0, rough=0)
-            job = Job(SCENE, LEVEL, GOAL, count, js.Steps(2))
+            job = Job(SCENE, LEVEL, WANTED, count, js.Steps(2))
             _, effort = of_steps.search_steps(job, hint, budget, np.random.default_rng(1))
             assert effort.full == pushes["full"] <= budget
 
@@ -112,13 +114,15 @@ def test_where_no_stroke_is_found_the_plan_says_why():
     done = js.plan_sand(SCENE, LEVEL, trench, strokes=1, budget=30)
     assert done.paths == ()
     assert re.match("no stroke .* berms count: the goal has 4e-07 m.3 less sand .*; give .* berms of what", done.reason)
-    assert "4e-07 m^3 more sand" in why_no_strokes(SCENE, LEVEL, -trench)
+    assert "4e-07 m^3 more sand" in why_no_strokes(SCENE, LEVEL, as_goal(SCENE, -trench))
     for scene in (
         js.make_scene(SHAPE, 0.01, tool=js.Blade(), edge=js.Draining(-0.1)),  # sand may go, or has been walled in
         js.make_scene(SHAPE, 0.01, tool=js.Blade(), walls=js.Walls(np.indices(SHAPE)[0] == 7)),
     ):
-        assert "less sand" not in why_no_strokes(scene, LEVEL, trench)
-    assert re.match("no stroke .* berms count; allow more", why_no_strokes(SCENE, trench, np.roll(trench, 1, 0)))
+        assert "less sand" not in why_no_strokes(scene, LEVEL, as_goal(scene, trench))
+    assert re.match(
+        "no stroke .* berms count; allow more", why_no_strokes(SCENE, trench, as_goal(SCENE, np.roll(trench, 1, 0)))
+    )
 
 
 def test_steps_find_a_path_again():
@@ -141,7 +145,7 @@ def test_no_stroke_lowers_more_than_the_proven_amount(surface, neighbours):
     rough = {"level": 0.0, "rough": 0.02}[surface] * rng.normal(size=SHAPE)
     height = np.asarray(js.settle(scene, rough.astype(np.float32)).height)
     most, longest = 0.0, 0.08
-    ways = propose(scene, js.Lattice(longest=8), height, height, 32, rng)
+    ways = propose(scene, js.Lattice(longest=8), height, as_goal(scene, height), 32, rng)
     maps = np.repeat(height[None], 32, axis=0)
     for _ in range(2):
         maps = pushed(scene, maps, ways)
@@ -154,15 +158,17 @@ def test_no_stroke_lowers_more_than_the_proven_amount(surface, neighbours):
 
 def test_the_bound_is_exact_where_it_can_be_told():
     high = LEVEL + np.float32(0.001)
-    assert least_distance(SCENE, high, LEVEL, 9, 0.1) == pytest.approx(0.014)  # no sand to be lost
+    assert least_distance(SCENE, high, as_goal(SCENE, LEVEL), 9, 0.1) == pytest.approx(0.014)  # no sand to be lost
     far = LEVEL.copy()
     far[:7], far[7:] = 1.0, -1.0  # far more to move than a stroke can
     amount = most_lowered(SCENE, LEVEL, 0.05)
-    assert math.sqrt(98 * 1 + 98 * 0.9925**2) - 0.1 < least_distance(SCENE, LEVEL, far, 1, 0.05) < 14
-    assert least_distance(SCENE, LEVEL, far, 2, 0.05) < least_distance(SCENE, LEVEL, far, 1, 0.05)
+    assert math.sqrt(98 * 1 + 98 * 0.9925**2) - 0.1 < least_distance(SCENE, LEVEL, as_goal(SCENE, far), 1, 0.05) < 14
+    assert least_distance(SCENE, LEVEL, as_goal(SCENE, far), 2, 0.05) < least_distance(
+        SCENE, LEVEL, as_goal(SCENE, far), 1, 0.05
+    )
     assert amount > 0.0075 * 2 * 5
     isotropic = js.make_scene(SHAPE, 0.01, tool=js.Blade(), neighbours="isotropic")
-    assert least_distance(isotropic, LEVEL, far, 1, 0.05) == 0
+    assert least_distance(isotropic, LEVEL, as_goal(isotropic, far), 1, 0.05) == 0
 
 
 def test_nodes_that_look_alike_are_one():
@@ -190,7 +196,7 @@ def test_children_are_pushed_as_they_would_be_alone():
 def test_strokes_stay_on_the_map_and_within_their_length():
     rng = np.random.default_rng(0)
     actions = js.Lattice(pitch=2.0, shortest=3.0, longest=6.0)
-    ways = propose(SCENE, actions, LEVEL, GOAL, 50, rng)
+    ways = propose(SCENE, actions, LEVEL, WANTED, 50, rng)
     assert ways.shape == (50, 4)
     np.testing.assert_allclose((ways / 0.01 - 1) % 2, 0, atol=1e-6)
     for strokes, least in ((ways, 0.03), (moved(SCENE, actions, ways, rng), 0)):
@@ -202,13 +208,13 @@ def test_strokes_stay_on_the_map_and_within_their_length():
 def test_the_binary_plan_and_the_rivals():
     drawn = LEVEL.copy()
     drawn[4:6, 2:10], drawn[6:10, 8:10] = -0.0075, -0.0075
-    (walk,) = binary_paths(SCENE, LEVEL, drawn, js.Steps(2))
+    (walk,) = binary_paths(SCENE, LEVEL, as_goal(SCENE, drawn), js.Steps(2))
     assert len(walk) == 6
     assert [b - a for a, b in straight_runs(walk)] in ([3, 2], [2, 3])
-    job = Job(SCENE, LEVEL, GOAL, 2, js.Lattice())
+    job = Job(SCENE, LEVEL, WANTED, 2, js.Lattice())
     for rival in (binary, greedy, shooting):
         paths, effort = rival(job, 60, np.random.default_rng(0))
-        assert distance(replay(SCENE, LEVEL, paths), GOAL) <= distance(LEVEL, GOAL)
+        assert distance(replay(SCENE, LEVEL, paths), WANTED) <= distance(LEVEL, WANTED)
         assert effort.full > 0
     assert greedy(job, 60, np.random.default_rng(0))[1].cost <= 60
 
@@ -243,7 +249,7 @@ def test_every_task_is_at_rest_and_has_something_to_do():
     for name in SAND_TASKS:
         task = sand_task(name)
         assert float(js.steepest_slope(task.scene, task.height)) < math.tan(math.radians(29)) + 2e-3
-        assert float(distance(task.height, task.goal)) > 0.01
+        assert float(distance(task.height, as_goal(task.scene, task.goal))) > 0.01
         assert abs(float(np.mean(task.goal - task.height))) < 1e-6
     with pytest.raises(ValueError, match="task: got 'sieve'; give one of crossing, twin"):
         sand_task("sieve")

@@ -12,14 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.goals.goal import Goal
 from jaxsand.interaction.simulate import STROKES
 from jaxsand.planning.gradient import moves
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses
 from jaxsand.planning.no_strokes import why_no_strokes
-from jaxsand.planning.stroke_loss import GRADIENT, Best, SandLoss, pushed
+from jaxsand.planning.stroke_loss import GRADIENT, Best, pushed, sand_loss
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.scene.masked import POINTS, gaps
+from jaxsand.scene.masked import POINTS
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, as_array, blade_of
 
@@ -36,8 +37,8 @@ class Optimised:
     Attributes:
       strokes: the best plan [N, 4] = x0, y0, x1, y1 (m), in order, or [N, 6] = x0, y0, z0, x1, y1, z1 (m) from a guess with
         heights; N is 0 if nothing was found or nothing is to change.
-      losses: sum (h - goal)^2 (m^2) of the start, then of every better plan found on the way [K]; the last is that of
-        `strokes`.
+      losses: the cost, sum (h - goal)^2 (m^2) for a goal that is a map, of the start, then of every better plan found on the
+        way [K]; the last is that of `strokes`.
       calls: after how many calls of the simulator each of `losses` was found [K].
       spent: calls in all: pushes simulated, a gradient counted as what it costs.
       height: the map [H, W] (m) that `strokes` leave.
@@ -87,7 +88,7 @@ class Blurred:
 
 def optimise_strokes(
     scene: Scene,
-    goal: jax.typing.ArrayLike,
+    goal: Goal | jax.typing.ArrayLike,
     *,
     strokes: int | None = None,
     key: jax.Array | int = 0,
@@ -100,13 +101,13 @@ def optimise_strokes(
 ) -> Optimised:
     """Finds straight pushes that turn one map into another, by gradients through the simulator.
 
-    Minimises sum (h - goal)^2 over plans of strokes, h [H, W] the map that a plan leaves. Stops when the loss is a
-    ten-thousandth of the start's, or when the budget is spent.
+    Minimises the goal's cost over plans of strokes: sum (h - goal)^2, h [H, W] the map that a plan leaves, or what a `Goal`
+    with weights says. Stops when the loss is a ten-thousandth of the start's, or when the budget is spent.
 
     Args:
       scene: grid, sand and a `Blade`.
-      goal: heights [H, W] (m), `goal[i, j]` at x = (j + 1/2) dx, y = (i + 1/2) dx; cells that are NaN or masked are free:
-        the sand there may have any height, and the loss leaves them out.
+      goal: heights [H, W] (m), `goal[i, j]` at x = (j + 1/2) dx, y = (i + 1/2) dx, or a `Goal`, which says what matters.
+        Cells that are NaN or masked are free: the sand there may have any height, and the loss leaves them out.
       strokes: how many pushes; None lets the optimiser choose as many as pay, up to `most`.
       key: a JAX key or a whole number; the same key finds the same plan on the same machine.
       start: the map [H, W] (m) before the first push, at rest; None stands for level sand at 0.
@@ -146,10 +147,10 @@ def optimise_strokes(
     if strokes is not None:
         check_whole("strokes", strokes, 1, 64)
     level = np.zeros(scene.grid.shape, np.float32)
-    sand = SandLoss(
+    sand = sand_loss(
         scene,
         level if start is None else np.asarray(as_array("start", start), np.float32),
-        np.asarray(as_array("goal", gaps(goal)), np.float32),
+        goal,
     )
     rng = np.random.default_rng(_entropy(key))
     account = Account(sand, budget, tell)

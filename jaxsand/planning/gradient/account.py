@@ -46,12 +46,13 @@ class Account:
     def gradient(self, plans: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
         """The losses [P] of plans [P, N, 4] or [P, N, 6], and the gradients of those of maps blurred by `blur` cells."""
         self.calls += len(plans) * plans.shape[1] * (1 + GRADIENT)
-        sharp: list[np.ndarray] = []
+        sharp, power = list[np.ndarray](), self.sand.goal.power
 
         def weigh(off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            sharp.append((off**2).sum((1, 2)))
+            sharp.append((np.abs(off) ** power).sum((1, 2)))
             soft = gaussian_filter(off, (0, blur, blur)) if blur else off
-            return sharp[0], 2 * (gaussian_filter(soft, (0, blur, blur)) if blur else soft)
+            slope = 2 * soft if power == 2 else np.sign(soft)
+            return sharp[0], gaussian_filter(slope, (0, blur, blur)) if blur else slope
 
         losses, gradients = self.sand.gradient(plans, weigh)
         self._note(plans, losses)
@@ -76,7 +77,7 @@ class Account:
         first = int(np.argmin(losses))
         if np.isfinite(losses[first]) and (not self.history or losses[first] < self.best.loss):
             self.history.append(Best(self.calls, float(losses[first]), plans[first].copy()))
-            left = np.sqrt(losses[first] / self.before) if self.before else 0.0
+            left = (losses[first] / self.before) ** (1 / self.sand.goal.power) if self.before else 0.0
             self.tell(
                 f"{self.calls:,} of {self.budget:,} calls: {len(plans[first])} strokes, {left:.1%} of the distance left"
             )

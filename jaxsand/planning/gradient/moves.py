@@ -11,7 +11,6 @@ import jax
 import numpy as np
 import optax
 
-from jaxsand.goals.metrics import still_to_do
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.sketch import Print, guesses, swaps
 
@@ -145,7 +144,7 @@ def stroke_by_stroke(account: Account, strokes: int, calls: int, rng: np.random.
         rounds = max(1, calls // strokes // _DRAWN)
         for k in range(rounds):
             if k < max(1, rounds // 3):
-                drawn = _from_high_to_low(still_to_do(here, sand.goal), rng) * dx
+                drawn = _from_high_to_low(sand.goal.off(here), rng) * dx
                 anywhere = rng.random((_DRAWN, 4)) * (high - low) + low
                 drawn = np.where(rng.random((_DRAWN, 1)) < 0.5, drawn, anywhere)
             else:

@@ -27,7 +27,7 @@ class Ahead:
 
     Attributes:
       strokes: [N, 4] (m).
-      losses: [N + 1] squared distances (m^2) from the goal, of the start and after each stroke.
+      losses: [N + 1] costs by the goal, of the start and after each stroke.
       calls: how often the simulator was called.
     """
 
@@ -70,7 +70,7 @@ def look_ahead(policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, t
     plan, least, calls = plans[0], losses[0], 0
     for k in range(strokes):
         tell(f"stroke {k + 1} of {strokes}, {calls} pushes tried")
-        proposed = policy.propose(sand.scene, np.repeat(sand.goal[None], len(maps), 0), maps, width)[0]
+        proposed = policy.propose(sand.scene, sand.nearest(maps), maps, width)[0]
         parent = np.repeat(np.arange(len(maps)), proposed.shape[1])
         new = proposed.reshape(-1, 4)
         far, after = sand.after(maps[parent], new)

@@ -30,8 +30,8 @@ class Planned:
 
     Attributes:
       strokes: [N, 4] (m).
-      before: squared distance (m^2) of the start from the goal.
-      after: squared distance (m^2) after the strokes.
+      before: what the start costs by the goal: the squared distance (m^2), if all cells count alike.
+      after: the same after the strokes.
       calls: how often the simulator was called.
       reason: why there are no strokes, and what to do; None where there are some.
     """
@@ -60,7 +60,7 @@ def plan_by_policy(
         found = look_ahead(policy, sand, strokes, stages.width, tell)
         plan, after, calls = found.strokes, float(found.losses[-1]), found.calls
     else:
-        plans, maps = one_after_the_other(policy, sand.scene, sand.start[None], sand.goal[None], strokes)
+        plans, maps = one_after_the_other(policy, sand.scene, sand.start[None], sand.target[None], strokes)
         plan, after, calls = plans[0], sand.loss_of(maps[-1, 0]), strokes
     if stages.polish and len(plan):
         tell("gradients")

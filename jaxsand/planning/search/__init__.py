@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from jaxsand.goals import metrics
+from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search.actions import Actions, Flat, Job, Lattice, Path, Rising, Steps, longest_stroke
 from jaxsand.planning.search.binary import binary_hints, binary_paths
@@ -17,7 +18,6 @@ from jaxsand.planning.search.steps import search_steps
 from jaxsand.planning.search.strokes import search_strokes
 from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene, as_array, fit
 
 
@@ -29,10 +29,11 @@ class SandPlan:
       paths: points [n, 2] = x, y (m) of each path, or [n, 3] = x, y, z (m) with `Rising` or `Flat`, in order; the tool is
         lifted between paths.
       height: the map [H, W] (m) that `follow` makes of the paths, one after the other.
-      before: l2 distance (m) of the start from the goal, sqrt(sum (h - goal)^2) over the cells that are not free.
-      after: l2 distance (m) of `height` from the goal.
+      before: distance (m) of the start from the goal: sqrt(sum (h - goal)^2) over the cells that are not free, or what a
+        `Goal` with weights says.
+      after: distance (m) of `height` from the goal.
       lower_bound: proven: no plan of as many strokes as were allowed, however placed, comes closer than this (m). With
-        heights of their own it is what the mean height alone allows.
+        heights of their own it is what the volume alone allows.
       estimate: a guess (m) of what could be reached: what is left if every stroke gains as much as the best of all that were
         tried.
       effort: how many pushes were simulated in full, and how many roughly (see `plan_sand`).
@@ -80,7 +81,7 @@ class SandPlan:
 def plan_sand(
     scene: Scene,
     height: np.ndarray,
-    goal: np.ndarray,
+    goal: Goal | np.ndarray,
     *,
     strokes: int = 4,
     actions: Actions | None = None,
@@ -100,7 +101,8 @@ def plan_sand(
     Args:
       scene: grid, sand and a `Blade`.
       height: the map [H, W] (m) to start from, at rest; `height[i, j]` is at x = (j + 1/2) dx, y = (i + 1/2) dx.
-      goal: [H, W] (m); cells that are NaN or masked are free: the sand there may have any height.
+      goal: a map [H, W] (m), or a `Goal`, which says what matters. Cells that are NaN or masked are free: the sand there may
+        have any height.
       strokes: the largest number of strokes, or of legs.
       actions: `Lattice()` for strokes with the tool lifted in between (the default), `Steps()` for one path with the tool
         down, `Rising()` for strokes on which the tool rises or sinks, `Flat()` for strokes with a height each.
@@ -130,21 +132,21 @@ def plan_sand(
     The last lines are not run by the tests: compiling takes 20 s.
     """
     actions = Lattice() if actions is None else actions
-    height, goal = _checked(scene, height, goal)
+    height, wanted = _checked(scene, height), as_goal(scene, goal)
     _check_options(scene, actions, strokes, budget, seed)
-    job = Job(scene, height, goal, strokes, actions)
-    before = float(distance(height, goal))
+    job = Job(scene, height, wanted, strokes, actions)
+    before = float(distance(height, wanted))
     paths, effort = _search(job, budget, np.random.default_rng(seed)) if before > 0 else ([], Effort())
     after = replay(scene, height, paths)
-    left = float(distance(after, goal))
+    left = float(distance(after, wanted))
     if left > before:  # `follow` leaves slightly other maps than the search's own pushes
         paths, after, left = [], height, before
     if isinstance(actions, Rising | Flat):
-        bound = volume_distance(scene, height, goal)
+        bound = volume_distance(scene, height, wanted)
     else:
-        bound = least_distance(scene, height, goal, strokes, longest_stroke(scene, actions))
+        bound = least_distance(scene, height, wanted, strokes, longest_stroke(scene, actions))
     estimate = max(0.0, before - strokes * effort.gain)
-    reason = None if paths else why_no_strokes(scene, height, goal)
+    reason = None if paths else why_no_strokes(scene, height, wanted)
     return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason)
 
 
@@ -157,17 +159,15 @@ def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Pat
     return search_strokes(job, binary_hints(job), budget, rng)
 
 
-def _checked(scene: Scene, height: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The height (float32) and the goal (float64); raises ValueError unless they fit the scene and the height is at rest."""
+def _checked(scene: Scene, height: np.ndarray) -> np.ndarray:
+    """The height (float32); raises ValueError unless it fits the scene and is at rest."""
     blade_size(scene)
     height = np.asarray(fit(scene, as_array("height", height, np.float32))[1])
-    goal = np.asarray(gaps(goal), float)
-    metrics.fits_where_it_counts(scene, goal)
     metrics.finite(height, "height")
     slope, mu = float(steepest_slope(scene, height)), np.tan(np.asarray(scene.material.repose_angle, float))
     if slope > np.max(mu) + 2e-3:
         raise ValueError(f"height: got a slope of {slope:.3g}, steeper than repose ({np.max(mu):.3g}); settle it first")
-    return height, goal
+    return height
 
 
 def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, seed: int) -> None:

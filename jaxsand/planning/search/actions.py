@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.goals.metrics import still_to_do
+from jaxsand.goals.goal import Goal
 from jaxsand.scene.scene import Scene
 
 Path = np.ndarray  # [n, 2]: x, y (m), or [n, 3]: x, y, z (m)
@@ -122,14 +122,14 @@ class Job:
     Attributes:
       scene: grid, sand and blade.
       height: the map [H, W] (m) to start from, at rest.
-      goal: [H, W] (m), NaN where it is free.
+      goal: what is wanted, as `as_goal` makes it.
       strokes: the largest number of strokes or legs.
       actions: their kind.
     """
 
     scene: Scene
     height: np.ndarray
-    goal: np.ndarray
+    goal: Goal
     strokes: int
     actions: Any
 
@@ -143,9 +143,9 @@ def longest_stroke(scene: Scene, actions: Actions) -> float:
 
 
 def propose(
-    scene: Scene, actions: Lattice, height: np.ndarray, goal: np.ndarray, count: int, rng: np.random.Generator
+    scene: Scene, actions: Lattice, height: np.ndarray, goal: Goal, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draws random strokes [count, 4] (m) on the lattice that may bring `height` [H, W] closer to `goal` [H, W].
+    """Draws random strokes [count, 4] (m) on the lattice that may bring `height` [H, W] closer to the goal.
 
     A quarter of the strokes each run from too much sand to too little, from too much to too much, from too much to anywhere,
     and from anywhere to anywhere.
@@ -153,7 +153,7 @@ def propose(
     spacing = float(scene.grid.spacing)
     points = _lattice(scene, actions)
     rows, columns = np.floor(points[:, ::-1] / spacing).astype(int).T
-    surplus = _blurred(still_to_do(height, goal))[rows, columns]
+    surplus = _blurred(goal.off(height))[rows, columns]
     anywhere = np.full(len(points), 1 / len(points))
     much, little = shares(surplus, anywhere), shares(-surplus, anywhere)
     longest = longest_stroke(scene, actions) * (1 + 1e-9)

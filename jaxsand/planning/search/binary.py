@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from jaxsand.goals.metrics import still_to_do
+from jaxsand.goals.goal import Goal
 from jaxsand.planning.binary import connected_pieces, plan
 from jaxsand.planning.search.actions import Job, Steps, corners, longest_stroke
 from jaxsand.planning.search.reach import blade_size
@@ -14,7 +14,7 @@ _HINTS = 24
 
 
 def binary_paths(
-    scene: Scene, height: np.ndarray, goal: np.ndarray, steps: Steps, offset: tuple[int, int] = (0, 0), part: float = 0.5
+    scene: Scene, height: np.ndarray, goal: Goal, steps: Steps, offset: tuple[int, int] = (0, 0), part: float = 0.5
 ) -> list[np.ndarray]:
     """The walks of the binary plan, one over each connected piece to dig.
 
@@ -26,7 +26,7 @@ def binary_paths(
     """
     rows, columns = corners(scene, steps, offset).shape[:2]
     top, left = (steps.margin + o for o in offset)
-    surplus = still_to_do(height, goal)[top : top + rows * steps.cell, left : left + columns * steps.cell]
+    surplus = goal.off(np.asarray(height, float))[top : top + rows * steps.cell, left : left + columns * steps.cell]
     blocks = surplus.reshape(rows, steps.cell, columns, steps.cell).mean((1, 3))
     deepest = max(blade_size(scene)[2], float(surplus.max()))
     dig = np.flipud(blocks > part * deepest)
@@ -46,7 +46,7 @@ def straight_runs(walk: np.ndarray) -> list[tuple[int, int]]:
 
 
 def binary_strokes(
-    scene: Scene, height: np.ndarray, goal: np.ndarray, offset: tuple[int, int] = (0, 0), part: float = 0.5
+    scene: Scene, height: np.ndarray, goal: Goal, offset: tuple[int, int] = (0, 0), part: float = 0.5
 ) -> np.ndarray:
     """The straight runs of the binary plan, on blocks as wide as the blade: [n, 4] (m), in order."""
     steps = Steps(blade_cells(scene))

@@ -7,7 +7,6 @@ plan is the best of many on the sand that those before it left; then the plan's 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from jaxsand.goals.metrics import still_to_do
 from jaxsand.planning.search.actions import Job, Path, longest_stroke, shares
 from jaxsand.planning.search.rollouts import Effort, distance, pushed
 from jaxsand.planning.search.strokes import finish
@@ -66,7 +65,7 @@ def propose_heights(job: Job, height: np.ndarray, count: int, rng: np.random.Gen
     the straight line that fits the goal best along their way. Two thirds are then moved a little up or down.
     """
     spacing = float(job.scene.grid.spacing)
-    todo, free = still_to_do(height, job.goal), np.isnan(job.goal)
+    todo, free, goal = job.goal.off(height), job.goal.free, np.asarray(job.goal.height)
     anywhere, none = np.full(todo.size, 1 / todo.size), np.zeros(todo.size)
     counts = shares(~free.ravel() * 1.0, anywhere)
     wanted = shares(-todo.ravel(), counts)
@@ -78,7 +77,7 @@ def propose_heights(job: Job, height: np.ndarray, count: int, rng: np.random.Gen
     ends = np.stack([columns, rows], axis=-1) + rng.normal(0, 2, (2, 4 * many, 2))  # in cells, cell centres whole numbers
     ends = np.clip(ends, 0, np.array(todo.shape[::-1]) - 1)
     size = _size(todo)
-    z, z[:, :many] = _along(job.goal, height, ends), _at(np.where(free, height, job.goal), ends[:, :many])
+    z, z[:, :many] = _along(goal, height, ends), _at(np.where(free, height, goal), ends[:, :many])
     z[0, :many] -= np.where(rng.random(many) < 0.5, rng.exponential(size, many), 0)
     z += rng.normal(0, 0.1 * size, z.shape) * (rng.random(4 * many) < 2 / 3)
     places = (ends + 0.5) * spacing
@@ -94,7 +93,7 @@ def around(
     They are moved about `scale` times 3 spacings, their heights half of what is to do on the map `height` [H, W].
     """
     units = np.full(6, float(job.scene.grid.spacing))
-    units[[2, 5]] = _size(still_to_do(height, job.goal))
+    units[[2, 5]] = _size(job.goal.off(height))
     size = scale * _AROUND * units * np.exp(rng.normal(0, 0.7, (count, 1)))
     moved = np.where(rng.random((count, 6)) < 0.7, rng.normal(size=(count, 6)) * size, 0)
     return within(job, strokes[rng.integers(0, len(strokes), count)] + moved)

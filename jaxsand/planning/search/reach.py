@@ -22,47 +22,56 @@ import math
 
 import numpy as np
 
-from jaxsand.goals.metrics import still_to_do
+from jaxsand.goals.goal import Goal, Power
 from jaxsand.scene.boundaries import Closed
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, square
 
 
-def least_distance(scene: Scene, height: np.ndarray, goal: np.ndarray, strokes: int, longest: float) -> float:
-    """A proven lower bound (m) of the l2 distance from `goal` after at most `strokes` strokes from `height`, which is at
-    rest.
+def least_distance(scene: Scene, height: np.ndarray, goal: Goal, strokes: int, longest: float) -> float:
+    """A proven lower bound (m) of the distance from `goal` after at most `strokes` strokes from `height`, which is at rest.
 
     It is the solution of
 
-        min |h + v - g|_2   with   sum v-  <=  n A,   sum v+  <=  n A,   v-  <=  (h + d)+,
+        min distance(h + v)   with   sum v-  <=  n A,   sum v+  <=  n A,   v-  <=  (h + d)+,
 
-    which cuts surplus and lack off at one level each. Free cells of the goal have neither. Where no sand drains and no cell
-    is free, the distance is also at least that of the
-    mean heights, over all cells. For isotropic sand, whose A is not proven, only the latter is used.
+    which for squares cuts surplus and lack off at one level of weight times height each. Where the cost says so, a cell has
+    neither. The distance is also at least `volume_distance`; for isotropic sand, whose A is not proven, only that is used.
 
     Args:
       scene: grid, sand and blade.
-      height, goal: maps [H, W] (m); the goal is NaN where it is free.
+      height: the map [H, W] (m).
+      goal: what is wanted.
       strokes: n.
       longest: the longest stroke allowed (m).
     """
-    surplus, uneven = still_to_do(height, goal), volume_distance(scene, height, goal)
+    surplus, uneven = goal.off(np.asarray(height, float)), volume_distance(scene, height, goal)
     if scene.grid.neighbours == "isotropic":
         return uneven
     amount = strokes * most_lowered(scene, height, longest)
     above = np.maximum(np.asarray(height, float) + blade_size(scene)[2], 0)
-    left = _cut_off(np.maximum(surplus, 0), above, amount) ** 2 + _cut_off(np.maximum(-surplus, 0), np.inf, amount) ** 2
-    return max(uneven, math.sqrt(left.sum()))
+    cost = 0.0
+    for excess, most, side in ((surplus, above, goal.above), (-surplus, np.inf, goal.below)):
+        weight = np.asarray(side)
+        left = _cut_off(np.maximum(excess, 0), weight, most, amount, goal.power)
+        cost += float((weight * left**goal.power).sum())
+    return max(uneven, cost ** (1 / goal.power))
 
 
-def volume_distance(scene: Scene, height: np.ndarray, goal: np.ndarray) -> float:
-    """The l2 distance (m) that is left however the sand is moved: that of the mean heights, over all cells.
+def volume_distance(scene: Scene, height: np.ndarray, goal: Goal) -> float:
+    """The distance (m) that is left however the sand is moved, because the goal has more sand than the map, or less.
 
-    It is 0 where sand drains, or where a cell of the goal is free.
+    The least of sum w_i x_i^p with sum x_i = V is V^2 / sum (1 / w_i) or, with p = 1, V min w_i. For weights of 1 and p = 2
+    that is the l2 distance of the mean heights. It is 0 where sand drains, where a cell is free, or where what there is too
+    much or too little of costs nothing somewhere.
     """
-    if not isinstance(scene.edge, Closed) or np.isnan(goal).any():
+    if not isinstance(scene.edge, Closed) or goal.free.any():
         return 0.0
-    return float(abs(still_to_do(height, goal).sum()) / math.sqrt(np.size(goal)))
+    more = float((np.asarray(height, float) - goal.height).sum())
+    weight = np.asarray(goal.above if more > 0 else goal.below)
+    if not (weight > 0).all():
+        return 0.0
+    return abs(more) * float(weight.min() if goal.power == 1 else 1 / math.sqrt((1 / weight).sum()))
 
 
 def most_lowered(scene: Scene, height: np.ndarray, longest: float) -> float:
@@ -103,13 +112,27 @@ def blade_size(scene: Scene) -> tuple[float, float, float]:
     return float(blade.width), float(blade.thickness), float(blade.depth)
 
 
-def _cut_off(excess: np.ndarray, at_most: np.ndarray | float, amount: float) -> np.ndarray:
-    """What is left of `excess`, least in l2, when `amount` in all and at most `at_most` of each cell may be taken away."""
+def _cut_off(excess: np.ndarray, weight: np.ndarray, at_most: np.ndarray | float, amount: float, power: Power) -> np.ndarray:
+    """What is left of `excess`, at the least sum weight left^power, when `amount` in all and at most `at_most` of each cell
+    may be taken away.
+    """
     taken = np.minimum(excess, at_most)
     if taken.sum() <= amount:
         return excess - taken
-    low, high = 0.0, float(excess.max())
+    if power == 1:  # from the heaviest cells first
+        order = np.argsort(-weight, axis=None, kind="stable")
+        before = np.cumsum(taken.ravel()[order]) - taken.ravel()[order]
+        some = np.zeros(excess.size)
+        some[order] = np.clip(amount - before, 0, taken.ravel()[order])
+        return excess - some.reshape(excess.shape)
+    each = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1), np.inf)
+    low, high = 0.0, float((weight * excess).max())
     for _ in range(60):
         level = (low + high) / 2
-        low, high = (level, high) if np.clip(excess - level, 0, at_most).sum() > amount else (low, level)
-    return excess - np.clip(excess - low, 0, at_most)
+        low, high = (level, high) if _above(excess, level, each, at_most).sum() > amount else (low, level)
+    return excess - _above(excess, low, each, at_most)
+
+
+def _above(excess: np.ndarray, level: float, each: np.ndarray, at_most: np.ndarray | float) -> np.ndarray:
+    """What lies above a level of weight times height, of weights 1 / `each`, and at most `at_most`."""
+    return np.clip(excess - np.where(np.isinf(each), np.inf, level * each), 0, at_most)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxsand.goals.metrics import still_to_do
+from jaxsand.goals.goal import Goal
 from jaxsand.interaction.batched import act_batch, step_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.outcome import check
@@ -25,7 +25,7 @@ class Effort:
     Attributes:
       full: full pushes.
       rough: rough pushes.
-      gain: the largest step of a full push towards the goal, in l2 (m).
+      gain: the largest step of a full push towards the goal (m).
     """
 
     full: int = 0
@@ -41,10 +41,10 @@ class Effort:
         return Effort(self.full + other.full, self.rough + other.rough, max(self.gain, other.gain))
 
 
-def distance(maps: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """The l2 distance (m) of maps [..., H, W] from the goal, where it counts; infinite for a map that is not finite."""
-    square = (still_to_do(np.asarray(maps, float), goal) ** 2).sum((-2, -1))
-    return np.where(np.isnan(square), np.inf, np.sqrt(square))
+def distance(maps: np.ndarray, goal: Goal) -> np.ndarray:
+    """The distance (m) of maps [..., H, W] from the goal; infinite for a map that is not finite."""
+    far = goal.distance(np.asarray(maps, float))
+    return np.where(np.isnan(far), np.inf, far)
 
 
 def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from jaxsand.goals.metrics import still_to_do
 from jaxsand.interaction.simulate import follow
 from jaxsand.planning.search.actions import Job, Path, corners
 from jaxsand.planning.search.rollouts import Effort, distance, distinct, marks, walked
@@ -61,7 +60,7 @@ def in_layers(job: Job, starts: Places, hint: Places, width: int) -> tuple[list[
       The best paths of each layer, with how far from the goal they leave the sand (m); and what the search cost.
     """
     at = corners(job.scene, job.actions)
-    grain = _GRAIN * np.abs(still_to_do(job.height, job.goal)).max()
+    grain = _GRAIN * np.abs(job.goal.off(job.height)).max()
     down, paths = np.repeat(job.height[None], len(starts), axis=0), starts[:, None]
     far = distance(down, job.goal)
     found: list[tuple[float, Places]] = []
@@ -99,7 +98,7 @@ def _starts(job: Job, at: np.ndarray, count: int) -> Places:
     """The `count` corners with the most surplus sand around them, or the first corner if there is none."""
     half = job.actions.cell // 2
     rows, columns = np.floor(at[..., ::-1] / float(job.scene.grid.spacing)).astype(int).reshape(-1, 2).T
-    surplus = np.pad(np.maximum(still_to_do(job.height, job.goal), 0).astype(float), half)
+    surplus = np.pad(np.maximum(job.goal.off(job.height), 0).astype(float), half)
     window = 2 * half + 1
     around = np.array([surplus[r : r + window, c : c + window].sum() for r, c in zip(rows, columns, strict=True)])
     best = [i for i in np.argsort(-around, kind="stable")[:count] if around[i] > 0] or [0]

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxsand.goals.metrics import still_to_do
 from jaxsand.planning.search.actions import Job, Path, confined, moved, propose
 from jaxsand.planning.search.rollouts import CHEAP, Effort, distance, distinct, marks, pushed, roughly_pushed
 from jaxsand.scene.scene import Scene
@@ -60,7 +59,7 @@ def in_layers(job: Job, hints: np.ndarray, budget: float, width: int, rng: np.ra
     They are ordered by distance from the goal, which is A*'s order: in f = g + h, with h the distance over the most that one
     stroke can change, g is the same for a whole layer and the divisor for all nodes.
     """
-    grain = _GRAIN * np.abs(still_to_do(job.height, job.goal)).max()
+    grain = _GRAIN * np.abs(job.goal.off(job.height)).max()
     nodes = Nodes(job.height[None], np.zeros((1, 0, 4)), distance(job.height[None], job.goal))
     exact = max(1, int(budget / job.strokes / 2))
     effort = Effort()

@@ -1,0 +1,131 @@
+"""A goal that says what matters: a height map, and what it costs where sand stands above it or below it."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxsand.goals.metrics import fits_where_it_counts
+from jaxsand.scene.masked import gaps
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.validation import concrete, short
+
+Power = Literal[1, 2]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Goal:
+    """A height map to be reached, and what each cell costs where the sand stands too high or too low.
+
+    With p the power, the cost of a map h is
+
+        J(h) = sum_ij  a_ij max(h_ij - g_ij, 0)^p + b_ij max(g_ij - h_ij, 0)^p,
+
+    and its distance from the goal J^(1/p), which for weights of 1 and p = 2 is the l2 distance. A cell with a = b = 0 is
+    free, and so is one whose goal is NaN: any height will do there. Where a = 0 and b = 1, heaps may lie, but holes may not.
+
+    Args:
+        height: g [H, W] (m), with g[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx; or maps [B, H, W].
+        above: a, the weight of sand above the goal, 0 or more: a number or a map [H, W].
+        below: b, the weight of sand below the goal, 0 or more: a number or a map [H, W].
+        power: p, 2 or 1. Squares spread what is left evenly; with 1 the cost is a mean difference, and a few cells may be
+            far off.
+
+    `cost` and `distance` take numpy or JAX arrays, and are differentiable in every map (with p = 1 not at the goal).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> import jaxsand as js
+        >>> goal = js.Goal(jnp.array([[-0.02, 0.0]]), above=jnp.array([[1.0, 0.0]]))  # the heap beside the hole is free
+        >>> print(f"{goal.distance(jnp.array([[-0.02, 0.02]])):.3f} {goal.distance(jnp.array([[0.0, 0.0]])):.3f}")
+        0.000 0.020
+    """
+
+    height: ArrayLike
+    above: ArrayLike = 1.0
+    below: ArrayLike = 1.0
+    power: Power = field(default=2, metadata={"static": True})
+
+    @property
+    def free(self) -> Any:
+        """Which cells may have any height, booleans [H, W]."""
+        return _space(self.height).isnan(self.height) | ((self.above == 0) & (self.below == 0))
+
+    def off(self, height: Any) -> Any:
+        """How far a map [..., H, W] stands above the goal where that costs, below 0 where it stands below (m); 0 elsewhere.
+
+        `height - off(height)` is the nearest map that costs nothing. A height that is not finite stays so.
+        """
+        xp = _space(height, self.height)
+        apart = height - xp.where(xp.isnan(self.height), height, self.height)
+        costs = ((apart > 0) & (xp.asarray(self.above) > 0)) | ((apart < 0) & (xp.asarray(self.below) > 0))
+        return xp.where(costs | ~xp.isfinite(apart), apart, 0)
+
+    def weight(self, off: Any) -> Any:
+        """The weight that differences of this sign have: of the one above where `off` is above 0, else of the one below."""
+        return _space(off, self.above, self.below).where(off > 0, self.above, self.below)
+
+    def residual(self, height: Any) -> tuple[Any, Any]:
+        """Differences r such that the cost is sum |r|^p, and their derivatives by the heights."""
+        off = self.off(height)
+        rate = self.weight(off) ** (1 / self.power)
+        return off * rate, _space(off).where(off == 0, 0, rate)
+
+    def cost(self, height: Any) -> Any:
+        """J of maps [..., H, W]: [...] (m^2, or m for p = 1)."""
+        off = self.off(height)
+        size = off**2 if self.power == 2 else abs(off)
+        return (self.weight(off) * size).sum((-2, -1))
+
+    def slope(self, height: Any) -> Any:
+        """The derivative of the cost by the heights, [..., H, W]; 0 at the goal."""
+        off = self.off(height)
+        return self.weight(off) * (2 * off if self.power == 2 else _space(off).sign(off))
+
+    def distance(self, height: Any) -> Any:
+        """J^(1/p) of maps [..., H, W]: [...] (m)."""
+        cost = self.cost(height)
+        if self.power == 1:
+            return cost
+        xp = _space(cost)
+        return xp.where(cost == 0, 0, xp.sqrt(xp.where(cost == 0, 1, cost)))
+
+
+def as_goal(scene: Scene, goal: Goal | ArrayLike, name: str = "goal") -> Goal:
+    """A user's goal for the scene, as numpy maps of floats: NaN in every free cell, and weights of the grid's shape.
+
+    Raises:
+      ValueError: if a map has another shape or an infinite cell, a weight is below 0, no cell counts, or the power is
+        neither 1 nor 2.
+    """
+    given = goal if isinstance(goal, Goal) else Goal(goal)
+    if given.power not in (1, 2):
+        raise ValueError(f"{name}.power: got {given.power!r}; give 1 or 2")
+    height = np.array(gaps(given.height))
+    if height.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: got {short(given.height)}; give a height map [H, W] of numbers (m)")
+    height = height.astype(float)
+    above, below = (_weights(f"{name}.{side}", getattr(given, side), scene) for side in ("above", "below"))
+    if height.shape == scene.grid.shape:
+        height = np.where((above == 0) & (below == 0), np.nan, height)
+    fits_where_it_counts(scene, height, name)
+    free = np.isnan(height)
+    return Goal(height, np.where(free, 0, above), np.where(free, 0, below), given.power)
+
+
+def _weights(name: str, value: ArrayLike, scene: Scene) -> np.ndarray:
+    """Weights as a map; ValueError unless they are finite and 0 or more."""
+    array = concrete(value)
+    shape = scene.grid.shape
+    if array is None or array.shape not in ((), shape) or not np.all(np.isfinite(array) & (array >= 0)):
+        raise ValueError(f"{name}: got {short(value)}; give a weight of 0 or more, or a map of them of shape {list(shape)}")
+    return np.broadcast_to(array.astype(float), shape)
+
+
+def _space(*arrays: Any) -> Any:
+    """JAX's numpy if one of them is JAX's, else numpy."""
+    return jnp if any(isinstance(a, jax.Array) for a in arrays) else np
