@@ -174,7 +174,7 @@ _HOMES = {
     "volume": "scene.scene",
 }
 __all__ = [*_HOMES]
-_OTHER_NAMES = ("env", "forces", "gym", "task", "trench")  # modules
+_OTHER_NAMES = ("env", "forces", "gym", "task", "tasks", "trench")  # modules
 
 
 def __getattr__(name: str) -> Any:

@@ -142,7 +142,9 @@ def test_free_cells_do_not_count():
     goal = np.full(SHAPE, np.nan)
     goal[2, 3] = 0.004
     assert distance(LEVEL[None], as_goal(SCENE, goal)).tolist() == [0.004]
-    assert np.isinf(distance(np.full((1, *SHAPE), np.nan), as_goal(SCENE, goal))[0])  # a map that is not clean is no solution
+    assert np.isinf(
+        distance(np.full((1, *SHAPE), np.nan), as_goal(SCENE, goal))[0]
+    )  # a map that is not clean is no solution
     assert np.count_nonzero(Goal(goal).off(LEVEL + 1)) == 1
     assert volume_distance(SCENE, LEVEL, as_goal(SCENE, goal)) == 0
     assert volume_distance(SCENE, LEVEL, as_goal(SCENE, LEVEL + 0.001)) == pytest.approx(0.001 * np.sqrt(240))

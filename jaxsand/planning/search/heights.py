@@ -8,31 +8,61 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from jaxsand.planning.search.actions import Job, Path, longest_stroke, shares
+from jaxsand.planning.search.coverage import READINGS, coverage
 from jaxsand.planning.search.rollouts import Effort, distance, pushed
 from jaxsand.planning.search.strokes import finish
+from jaxsand.planning.search.transport import heaviest
 
 _ROUNDS = 4  # of trials for a stroke: the first are drawn anew, the others lie around the best
 _KEPT = 8  # of a stroke's trials, for others around them
 _AROUND = np.array([3.0, 3.0, 0.5, 3.0, 3.0, 0.5])  # how far these lie: in spacings, heights in the size of what is to do
-_GREEDY = 0.7  # of the budget is for the strokes one after the other; the rest varies them
+_COVERAGE = 0.2  # of the budget at most is for coverage paths
+_GREEDY = 0.5  # of the budget is for the strokes one after the other; the rest varies the better of the two plans
 _VARIANTS = 16  # of a stroke at a time
 _PLACES = 17  # on a stroke's way at which the goal is looked at
 
 
 def search_heights(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
     """The best strokes with heights found for a job, at a cost of at most `budget` full pushes."""
-    plan, effort = one_by_one(job, max(_GREEDY * budget, min(budget, job.strokes)), rng)
+    rows, effort = best_coverage(job, _COVERAGE * budget)
+    plan, more = one_by_one(job, max(_GREEDY * budget, min(budget - effort.cost, job.strokes)), rng)
+    effort += more
+    if len(rows) and budget - effort.cost >= len(rows) + len(plan):
+        effort += Effort(full=len(rows) + len(plan))
+        ends = [distance(finish(job.scene, some[None], 0, job.height[None])[-1, 0], job.goal) for some in (rows, plan)]
+        plan = rows if ends[0] < ends[1] else plan
     if len(plan):
         plan, more = _varied(job, plan, budget - effort.cost, rng)
         effort += more
     return [stroke.reshape(2, 3) for stroke in plan], effort
 
 
+def best_coverage(job: Job, budget: float) -> tuple[np.ndarray, Effort]:
+    """The best coverage path [n, 6] (m) of as many readings as the budget allows, cut off where more rows do not help."""
+    plans, cost = list[np.ndarray](), 0
+    for reading in READINGS:
+        plan = within(job, coverage(job.scene, job.goal, job.height, reading)[: job.strokes])
+        if cost + len(plan) > budget:
+            break
+        plans.append(plan)
+        cost += len(plan)
+    most = max(map(len, plans), default=0)
+    if not most:
+        return np.zeros((0, 6)), Effort()
+    high = float(job.height.max()) + 1.0
+    spare = np.array([0.0, 0.0, high, float(job.scene.grid.spacing), 0.0, high])  # in the air, which changes nothing
+    filled = np.stack([np.concatenate([plan, np.repeat(spare[None], most - len(plan), axis=0)]) for plan in plans])
+    ends = distance(finish(job.scene, filled, 0, job.height[None]), job.goal)
+    rows, best = np.unravel_index(int(ends.argmin()), ends.shape)
+    return plans[best][:rows], Effort(full=cost)
+
+
 def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[np.ndarray, Effort]:
     """A plan [k, 6] (m), k <= `job.strokes`, in which each stroke is the best of those tried on the sand before it.
 
-    A quarter of a stroke's trials are drawn anew, and each further quarter lies around the best of all before, ever closer.
-    Where none of them brings the sand closer to the goal, others are tried in place of the next stroke.
+    A quarter of a stroke's trials are drawn anew, one of them from the plan of least work, and each further quarter lies
+    around the best of all before, ever closer. Where none of them brings the sand closer to the goal, others are tried in
+    place of the next stroke.
     """
     here, left = job.height, float(distance(job.height, job.goal))
     plan, effort = np.zeros((0, 6)), Effort()
@@ -42,7 +72,7 @@ def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[np.nd
         kept, far, best = np.zeros((0, 6)), np.zeros(0), None
         for turn in range(rounds):
             count = share // rounds + (turn < share % rounds)
-            tried = around(job, here, kept, count, 0.5**turn, rng) if turn else propose_heights(job, here, count, rng)
+            tried = around(job, here, kept, count, 0.5**turn, rng) if turn else _anew(job, here, count, rng)
             maps = pushed(job.scene, np.repeat(here[None], count, axis=0), tried)
             ends = distance(maps, job.goal)
             effort += Effort(full=count, gain=max(0.0, left - float(ends.min())))
@@ -54,6 +84,12 @@ def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[np.nd
         if best is not None and far[0] < left:
             here, left, plan = best, float(far[0]), np.concatenate([plan, kept[:1]])
     return plan, effort
+
+
+def _anew(job: Job, here: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Strokes [count, 6] (m) to try on a map: that of the plan of least work, and random ones."""
+    first = within(job, heaviest(job.scene, job.goal, here))
+    return np.concatenate([first, propose_heights(job, here, count - len(first), rng)])
 
 
 def propose_heights(job: Job, height: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
