@@ -1,16 +1,16 @@
 """What a search for earth-moving strokes has to beat: coverage paths, random strokes, and plans of least work.
 
-Each takes a job and a budget of pushes, and returns strokes [n, 6] = x0, y0, z0, x1, y1, z1 (m) and the pushes it tried.
+Each takes a job and a budget of pushes, and returns strokes [n, 6] = x0, y0, z0, x1, y1, z1 (m) with the distance that they
+leave, and the pushes it tried.
 """
 
 import numpy as np
 
 from jaxsand.planning.search.actions import Job
-from jaxsand.planning.search.heights import best_coverage, propose_heights
+from jaxsand.planning.search.heights import Ended, best_coverage, least_work, propose_heights
 from jaxsand.planning.search.rollouts import Effort, distance, pushed
-from jaxsand.planning.search.transport import heaviest
 
-Found = tuple[np.ndarray, Effort]
+Found = tuple[Ended, Effort]
 
 
 def coverage_paths(job: Job, budget: float, rng: np.random.Generator) -> Found:
@@ -26,18 +26,11 @@ def random_strokes(job: Job, budget: float, rng: np.random.Generator) -> Found:
     maps = np.repeat(job.height[None], count, axis=0)
     for way in ways:
         maps = pushed(job.scene, maps, way)
-    return np.stack(ways)[:, int(distance(maps, job.goal).argmin())], Effort(full=count * job.strokes)
+    ends = distance(maps, job.goal)
+    return (np.stack(ways)[:, int(ends.argmin())], float(ends.min())), Effort(full=count * job.strokes)
 
 
-def least_work(job: Job, budget: float, rng: np.random.Generator) -> Found:
-    """Strokes along the plan of least work, made anew on the sand that each stroke leaves; none is tried before."""
+def transported(job: Job, budget: float, rng: np.random.Generator) -> Found:
+    """Strokes along the plan of least work, made anew on the sand that each leaves; see `least_work`."""
     del rng
-    maps, plan = [job.height], np.zeros((0, 6))
-    for _ in range(min(job.strokes, int(budget))):
-        stroke = heaviest(job.scene, job.goal, maps[-1])
-        after = pushed(job.scene, maps[-1][None], stroke)[0] if len(stroke) else np.full_like(job.height, np.nan)
-        if np.isnan(after).any():
-            break
-        maps.append(after)
-        plan = np.concatenate([plan, stroke])
-    return plan[: int(distance(np.stack(maps), job.goal).argmin())], Effort(full=len(plan))
+    return least_work(job, budget)

@@ -17,28 +17,52 @@ _ROUNDS = 4  # of trials for a stroke: the first are drawn anew, the others lie 
 _KEPT = 8  # of a stroke's trials, for others around them
 _AROUND = np.array([3.0, 3.0, 0.5, 3.0, 3.0, 0.5])  # how far these lie: in spacings, heights in the size of what is to do
 _COVERAGE = 0.2  # of the budget at most is for coverage paths
-_GREEDY = 0.5  # of the budget is for the strokes one after the other; the rest varies the better of the two plans
+_GREEDY = 0.45  # of the budget is for the strokes one after the other; the rest varies the best plan
 _VARIANTS = 16  # of a stroke at a time
+_LEAST_WORK = 0.1  # of the budget at most is for a plan of least work
 _PLACES = 17  # on a stroke's way at which the goal is looked at
+
+Ended = tuple[np.ndarray, float]
+"""A plan [k, 6] (m) of at most as many strokes as the job allows, and how far from the goal it leaves the sand (m)."""
 
 
 def search_heights(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
-    """The best strokes with heights found for a job, at a cost of at most `budget` full pushes."""
-    rows, effort = best_coverage(job, _COVERAGE * budget)
-    plan, more = one_by_one(job, max(_GREEDY * budget, min(budget - effort.cost, job.strokes)), rng)
+    """The best strokes with heights found for a job, at a cost of at most `budget` full pushes.
+
+    The best of three plans is varied: a coverage path, a plan of least work, and strokes that are each the best of many.
+    """
+    plans, effort = list[Ended](), Effort()
+    for make, share in ((best_coverage, _COVERAGE), (least_work, _LEAST_WORK)):
+        found, more = make(job, share * budget)
+        plans.append(found)
+        effort += more
+    found, more = one_by_one(job, max(_GREEDY * budget, min(budget - effort.cost, job.strokes)), rng)
+    plan, _ = min([*plans, found], key=lambda one: one[1])
     effort += more
-    if len(rows) and budget - effort.cost >= len(rows) + len(plan):
-        effort += Effort(full=len(rows) + len(plan))
-        ends = [distance(finish(job.scene, some[None], 0, job.height[None])[-1, 0], job.goal) for some in (rows, plan)]
-        plan = rows if ends[0] < ends[1] else plan
     if len(plan):
         plan, more = _varied(job, plan, budget - effort.cost, rng)
         effort += more
     return [stroke.reshape(2, 3) for stroke in plan], effort
 
 
-def best_coverage(job: Job, budget: float) -> tuple[np.ndarray, Effort]:
-    """The best coverage path [n, 6] (m) of as many readings as the budget allows, cut off where more rows do not help."""
+def least_work(job: Job, budget: float) -> tuple[Ended, Effort]:
+    """Strokes along the plan of least work, made anew on the sand that each leaves, and none of them tried before."""
+    maps, plan, effort = [job.height], np.zeros((0, 6)), Effort()
+    for _ in range(min(job.strokes, int(budget))):
+        stroke = within(job, heaviest(job.scene, job.goal, maps[-1]))
+        if not len(stroke):
+            break
+        after, effort = pushed(job.scene, maps[-1][None], stroke)[0], effort + Effort(full=1)
+        if np.isnan(after).any():
+            break
+        maps.append(after)
+        plan = np.concatenate([plan, stroke])
+    ends = distance(np.stack(maps), job.goal)
+    return (plan[: int(ends.argmin())], float(ends.min())), effort
+
+
+def best_coverage(job: Job, budget: float) -> tuple[Ended, Effort]:
+    """The best coverage path of as many readings as the budget allows, cut off where more rows do not help."""
     plans, cost = list[np.ndarray](), 0
     for reading in READINGS:
         plan = within(job, coverage(job.scene, job.goal, job.height, reading)[: job.strokes])
@@ -48,17 +72,17 @@ def best_coverage(job: Job, budget: float) -> tuple[np.ndarray, Effort]:
         cost += len(plan)
     most = max(map(len, plans), default=0)
     if not most:
-        return np.zeros((0, 6)), Effort()
+        return (np.zeros((0, 6)), float(distance(job.height, job.goal))), Effort()
     high = float(job.height.max()) + 1.0
     spare = np.array([0.0, 0.0, high, float(job.scene.grid.spacing), 0.0, high])  # in the air, which changes nothing
     filled = np.stack([np.concatenate([plan, np.repeat(spare[None], most - len(plan), axis=0)]) for plan in plans])
     ends = distance(finish(job.scene, filled, 0, job.height[None]), job.goal)
     rows, best = np.unravel_index(int(ends.argmin()), ends.shape)
-    return plans[best][:rows], Effort(full=cost)
+    return (plans[best][:rows], float(ends.min())), Effort(full=cost)
 
 
-def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[np.ndarray, Effort]:
-    """A plan [k, 6] (m), k <= `job.strokes`, in which each stroke is the best of those tried on the sand before it.
+def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[Ended, Effort]:
+    """A plan in which each stroke is the best of those tried on the sand before it.
 
     A quarter of a stroke's trials are drawn anew, one of them from the plan of least work, and each further quarter lies
     around the best of all before, ever closer. Where none of them brings the sand closer to the goal, others are tried in
@@ -83,7 +107,7 @@ def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[np.nd
             kept, far = kept[order], far[order]
         if best is not None and far[0] < left:
             here, left, plan = best, float(far[0]), np.concatenate([plan, kept[:1]])
-    return plan, effort
+    return (plan, left), effort
 
 
 def _anew(job: Job, here: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
