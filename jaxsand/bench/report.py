@@ -29,6 +29,7 @@ from jaxsand.bench import (
     ramps,
     sand,
     stability,
+    tasks,
     trenches,
     work_precision,
 )
@@ -63,10 +64,10 @@ def bench(
     **strokes: Any,
 ) -> dict[str, Any]:
     """The figures for `what`: settle, push, plan, or all of these; env, grad, calibrate, sand, strokes, trench,
-    stability, letters, or ramp.
+    stability, letters, ramp, or tasks.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
-    `batch` is 4096, for env 1024, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`.
+    `batch` is 4096, for env 1024, for grad 64, for tasks 1 instance of each, unless given. `strokes` are options of `strokebench.bench_strokes`.
     """
     larger, batch = batch, batch or {"grad": 64, "env": 1024}.get(what, 4096)
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
@@ -115,6 +116,7 @@ def bench(
         "env": lambda: envs.bench_env(batch, tell),
         "stability": lambda: stability.stability(tell=tell),
         "letters": lambda: bench_letters(tell),
+        "tasks": lambda: tasks.bench_tasks(tell, seed=seed, **strokes),
     }
     if what in of_one_table:
         report[what] = of_one_table[what]()

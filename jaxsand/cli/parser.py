@@ -150,6 +150,7 @@ def _bench(commands: Any) -> None:
             "stability",
             "letters",
             "ramp",
+            "tasks",
         ],
         default="all",
     )

@@ -75,15 +75,15 @@ def make_task(name: str, key: int = 0) -> Task:
     return TASKS[name](np.random.default_rng(key))
 
 
-def figures(task: Task, height: Map) -> dict[str, float]:
+def figures(task: Task, height: Map) -> dict[str, float | None]:
     """How near a result comes to a task's goal, by the measures of several fields.
 
     Over the cells to be shaped: `mean_mm`, the mean |h - g|; `before_mm`, the same before; `changed`, the share that
     changed by more than a tenth of the largest change asked for. Elsewhere, where holes matter: `dug_outside_mm`, the mean
     of what is lower than the goal. As Terra has them (leggedrobotics/terra-baselines), of the cells to be dug: `coverage`,
     the share at or below the goal, and `completion`, whether all are, with a tenth of the largest change to spare. And
-    `iou`, of what is lower than the start by half the largest change; `distance`, by the goal's own cost (m), and
-    `reduction`, the share of it that is gone.
+    `iou`, of what is lower than the start by half the largest change; these three are None where nothing is to be dug.
+    `distance` is by the goal's own cost (m), and `reduction` the share of it that is gone.
 
     Args:
         task: the task.
@@ -109,9 +109,9 @@ def figures(task: Task, height: Map) -> dict[str, float]:
         "before_mm": 1e3 * float(np.abs(asked)[task.cells].mean()),
         "dug_outside_mm": 1e3 * float(np.maximum(wanted - height, 0)[others].mean()) if others.any() else 0.0,
         "changed": float((np.abs(height - start)[task.cells] > _CHANGED * largest).mean()),
-        "coverage": float(deep[dig].mean()) if dig.any() else 1.0,
-        "completion": float(deep[dig].all()),
-        "iou": float(iou(asked, np.where(task.cells, height - start, 0), largest)),
+        "coverage": float(deep[dig].mean()) if dig.any() else None,
+        "completion": float(deep[dig].all()) if dig.any() else None,
+        "iou": float(iou(asked, np.where(task.cells, height - start, 0), largest)) if dig.any() else None,
         "distance": after,
         "reduction": 1 - after / before if before else 0.0,
     }

@@ -1,0 +1,94 @@
+"""Earth-moving tasks by several methods at equal numbers of pushes, with the measures of several fields."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxsand.bench.rivals import earth
+from jaxsand.goals.goal import as_goal
+from jaxsand.goals.tasks import TASKS, Task, figures, make_task
+from jaxsand.planning.gradient import optimise_strokes
+from jaxsand.planning.search import plan_sand
+from jaxsand.planning.search.actions import Job, Rising
+from jaxsand.planning.search.rollouts import Effort, pushed
+from jaxsand.scene.progress import Tell, quiet
+
+Method = Callable[[Job, float, np.random.Generator], earth.Found]
+
+RIVALS: dict[str, Method] = {
+    "random": earth.random_strokes,
+    "coverage": earth.coverage_paths,
+    "least work": earth.transported,
+}
+SEARCH, GRADIENTS = "plan_sand", "plan_sand, then gradients"
+METHODS = (*RIVALS, SEARCH, GRADIENTS)
+
+
+def bench_tasks(
+    tell: Tell = quiet,
+    names: tuple[str, ...] = tuple(TASKS),
+    methods: tuple[str, ...] = METHODS,
+    instances: int = 1,
+    pushes: int = 500,
+    seed: int = 0,
+) -> list[dict[str, Any]]:
+    """A row for each task and method, with means over the instances (the worst is `worst_mm`); see `figures`.
+
+    Every method may use as many strokes as the task allows, and simulate `pushes` pushes; a gradient counts as what it
+    costs. `path_m` is the length of the strokes, and `moved` the volume (m^3) that they moved, summed over the strokes.
+
+    Raises:
+      ValueError: for a task or a method that does not exist.
+    """
+    for given, known in ((names, tuple(TASKS)), (methods, METHODS)):
+        for name in given:
+            if name not in known:
+                raise ValueError(f"bench tasks: got {name!r}; give some of {', '.join(known)}")
+    rows = []
+    for name in names:
+        for method in methods:
+            tell(f"{name}: {method}")
+            found = [_one(make_task(name, key), method, pushes, seed) for key in range(seed, seed + instances)]
+            known = [key for key in found[0] if all(one[key] is not None for one in found)]
+            means = {key: float(np.mean([one[key] for one in found])) if key in known else None for key in found[0]}
+            rows.append({"task": name, "method": method, **means, "worst_mm": max(one["mean_mm"] for one in found)})
+    return rows
+
+
+def _one(task: Task, method: str, pushes: int, seed: int) -> dict[str, Any]:
+    """The figures of a method on an instance of a task."""
+    began = time.perf_counter()
+    plan, effort = _planned(task, method, pushes, seed)
+    seconds = time.perf_counter() - began
+    maps = [task.start]
+    for stroke in plan:
+        maps.append(pushed(task.scene, maps[-1][None], stroke[None])[0])
+    moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in zip(maps[:-1], maps[1:], strict=True))
+    return {
+        **figures(task, maps[-1]),
+        "strokes": float(len(plan)),
+        "path_m": float(np.hypot(plan[:, 3] - plan[:, 0], plan[:, 4] - plan[:, 1]).sum()),
+        "moved": moved * float(task.scene.grid.spacing) ** 2,
+        "pushes": effort.cost,
+        "seconds": seconds,
+    }
+
+
+def _planned(task: Task, method: str, pushes: int, seed: int) -> tuple[np.ndarray, Effort]:
+    """The strokes [n, 6] (m) of a method, and what they cost."""
+    if method in RIVALS:
+        job = Job(task.scene, task.start, as_goal(task.scene, task.goal), task.strokes, Rising())
+        (plan, _), effort = RIVALS[method](job, pushes, np.random.default_rng(seed))
+        return plan, effort
+    budget = pushes // 2 if method == GRADIENTS else pushes
+    found = plan_sand(
+        task.scene, task.start, task.goal, strokes=task.strokes, actions=Rising(), budget=max(1, budget), seed=seed
+    )
+    plan, effort = found.strokes.reshape(-1, 6), found.effort
+    left = int(pushes - effort.cost)
+    if method == GRADIENTS and len(plan) and left > 0:
+        refined = optimise_strokes(task.scene, task.goal, start=task.start, guess=plan, budget=left, key=seed)
+        return refined.strokes, effort + Effort(full=refined.spent)
+    return plan, effort
