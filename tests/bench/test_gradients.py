@@ -28,6 +28,7 @@ def check_numbers(report):
             assert all(isinstance(v, str) or math.isfinite(v) for v in row.values()), row
 
 
+@pytest.mark.slow
 def test_the_figures_make_sense(report):
     check_numbers(report)
     (cost,) = report["gradient_cost"]

@@ -28,6 +28,7 @@ def of(rows, **what):
     return [row for row in rows if all(row[key] == value for key, value in what.items())]
 
 
+@pytest.mark.slow
 def test_every_row_is_there(table):
     report, profiles = table
     rows = report["rows"]
@@ -117,6 +118,7 @@ def test_error_against_spacing_and_the_papers_case_are_measured():
     assert max(best["error"], paper["error"]) < 0.02
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = ["trench", "--spacing-mm", "8", "--rule", "split", "--measured", str(FIXTURE), "--out", "out", "--json"]

@@ -103,6 +103,7 @@ def test_peaks_of_symmetric_trenches_follow_from_the_toes():
         assert profile.peaks == pytest.approx((total * (1 - math.sqrt(0.5)),) * 2, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trench", TRENCHES)
 def test_relaxed_sections_are_those_of_the_table(exact, trench):
     """The table's are of sampled sections, these of mean ones: a bit apart where a peak or a bottom is sharp."""
@@ -150,6 +151,7 @@ def test_relaxed_sand_lies_at_repose_and_within_its_toes(exact):
         assert np.abs(np.subtract(profile.toes, closed_form(one).toes)).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_areas_are_kept(exact):
     for one in [*RUNS, *GROUSED, *EDGES]:
         for profile in (closed_form(one), unsettled(one)):
@@ -189,6 +191,7 @@ PASSES = st.builds(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=1000, deadline=None, derandomize=True, database=None)
 @given(PASSES)
 def test_a_closed_form_is_sound_or_refused(one):

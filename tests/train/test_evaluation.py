@@ -31,6 +31,7 @@ class Knows:
         return np.array(out), np.zeros((len(goal), count))
 
 
+@pytest.mark.slow
 def test_a_policy_that_knows_the_strokes_gets_all_right():
     report = evaluate(Knows(), GLYPHS, Stages())
     assert {key: report[key] for key in ("right", "strict", "total", "stroke_right")} == {
