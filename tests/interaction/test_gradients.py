@@ -52,6 +52,7 @@ def test_a_push_and_its_settling(seed):
         assert float(forward(x, tangents)[1]) == pytest.approx(slope, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_where_nothing_changes_there_is_no_gradient():
     x = tuple(jnp.asarray(v, float) for v in point(0))
     assert np.array_equal(gradient(jnp.array([5.0, 5.0, 6.0, 6.0]), *x[1:])[0], np.zeros(4))

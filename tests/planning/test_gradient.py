@@ -138,6 +138,7 @@ def test_the_number_of_strokes_is_found(name, request):
     assert as_many_as_pay(counted, print_of(counted), 5, np.random.default_rng(0)) == len(goal.strokes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strokes", [1, pytest.param(None, marks=pytest.mark.slow)])
 def test_strokes_that_would_make_it_worse_are_not_given(short, strokes):
     bump = np.zeros((16, 16), np.float32)

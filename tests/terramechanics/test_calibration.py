@@ -131,6 +131,7 @@ def test_the_grids_error_is_told_through_gaps():
     assert gaps.covariance[0, 0] == pytest.approx(gaps.errors["repose_angle"] ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_an_error_that_is_not_known_is_no_number():
     """Left out, or with the sand's own angle beyond the range: the verdict says so, and the rest is the noise's."""

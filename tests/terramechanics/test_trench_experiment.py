@@ -45,6 +45,7 @@ def test_every_row_is_there(table):
     assert set(profiles) == {*rules, "closed-form", "exact", *aligned}
 
 
+@pytest.mark.slow
 def test_sections_are_steady_and_keep_their_area(table):
     report, profiles = table
     assert max(row["unsteady_mm"] for row in report["rows"] if "unsteady_mm" in row) < 0.3

@@ -128,6 +128,7 @@ def test_relaxing_sampled_sections_gives_the_table():
     assert depths == pytest.approx([TABLE[trench][1] for trench in TRENCHES[-4:]], abs=0.01)
 
 
+@pytest.mark.slow
 def test_relaxed_sections_converge_with_the_spacing(exact):
     coarse, middle, fine = (exact[spacing] for spacing in (1e-3, 5e-4, 2.5e-4))
     steps = [max(apart(a[trench], b[trench]) for trench in TRENCHES) for a, b in ((coarse, middle), (middle, fine))]

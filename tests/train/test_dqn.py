@@ -224,6 +224,7 @@ def test_letters_and_maps_set_apart_are_never_drawn():
     np.testing.assert_array_equal(SingleStroke().barred(look), [True, False])
 
 
+@pytest.mark.slow
 def test_a_chunk_is_a_function_of_the_state():
     state = QUICK.init(0)
     assert same(QUICK.advance(state)[0], QUICK.advance(state)[0])
