@@ -113,6 +113,7 @@ def test_a_push_that_touches_its_window_is_pushed_again_on_the_whole_map(bar, mo
     np.testing.assert_allclose(after, bar.goal, atol=5e-7)
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_not_finite_is_infinitely_far(bar):
     loss = SandLoss(bar.scene, bar.start, bar.goal)
     assert np.isinf(loss(np.full((1, 2, 4), np.nan)))[0]
