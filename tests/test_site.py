@@ -58,12 +58,15 @@ def run(path, slow):
     return names
 
 
-def fast(path):
-    """A page by its marks: where environments draw all their goals, that is most of it."""
-    return pytest.param(path, marks=pytest.mark.long if path.name == "environments.md" else ())
+LONG = ("environments.md", "landing-pad.md", "pit-and-heap.md", "sampling-trench.md", "tools.md")
 
 
-@pytest.mark.parametrize("path", [fast(path) for path in runnable(slow=False)], ids=named)
+def marked(path):
+    """A page by its marks: those that compile many programs are slow."""
+    return pytest.param(path, marks=pytest.mark.slow if path.name in LONG else ())
+
+
+@pytest.mark.parametrize("path", [marked(path) for path in runnable(slow=False)], ids=named)
 def test_code_runs(path):
     names = run(path, slow=False)
     if path == README:

@@ -2,9 +2,12 @@
 
 import time
 
+import pytest
+
 from jaxsand.bench.timing import race
 
 
+@pytest.mark.slow
 def test_ways_take_turns_and_the_first_call_is_told_apart():
     calls = []
 

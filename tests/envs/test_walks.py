@@ -5,6 +5,7 @@ from dataclasses import replace
 import chex
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxsand as js
 from jaxsand import envs
@@ -75,6 +76,7 @@ def test_random_walks_are_maps_of_one_piece():
     assert not any(min(np.ptp(np.argwhere(dig), axis=0)) == 0 for dig in np.asarray(turning.dig))
 
 
+@pytest.mark.slow
 def test_a_walk_on_sand_ends_with_the_planners_and_digs():
     dig, _ = letters.letter_map("L")
     env, params = js.make("single-stroke", on=envs.OnSand(), goals=one_map(dig))
