@@ -67,7 +67,8 @@ def bench(
     stability, letters, ramp, or tasks.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
-    `batch` is 4096, for env 1024, for grad 64, for tasks 1 instance of each, unless given. `strokes` are options of `strokebench.bench_strokes`.
+    `batch` is 4096, for env 1024, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`, or of
+    `tasks.bench_tasks`.
     """
     larger, batch = batch, batch or {"grad": 64, "env": 1024}.get(what, 4096)
     report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}

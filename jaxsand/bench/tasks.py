@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -51,10 +52,17 @@ def bench_tasks(
         for method in methods:
             tell(f"{name}: {method}")
             found = [_one(make_task(name, key), method, pushes, seed) for key in range(seed, seed + instances)]
-            known = [key for key in found[0] if all(one[key] is not None for one in found)]
-            means = {key: float(np.mean([one[key] for one in found])) if key in known else None for key in found[0]}
-            rows.append({"task": name, "method": method, **means, "worst_mm": max(one["mean_mm"] for one in found)})
+            worst = {"worst_mm": max(one["mean_mm"] for one in found)}
+            rows.append(
+                {"task": name, "method": method, **{key: _mean([one[key] for one in found]) for key in found[0]}, **worst}
+            )
     return rows
+
+
+def _mean(values: list[float | None]) -> float | None:
+    """The mean; None if one of the values is none."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def _one(task: Task, method: str, pushes: int, seed: int) -> dict[str, Any]:
@@ -65,7 +73,7 @@ def _one(task: Task, method: str, pushes: int, seed: int) -> dict[str, Any]:
     maps = [task.start]
     for stroke in plan:
         maps.append(pushed(task.scene, maps[-1][None], stroke[None])[0])
-    moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in zip(maps[:-1], maps[1:], strict=True))
+    moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in pairwise(maps))
     return {
         **figures(task, maps[-1]),
         "strokes": float(len(plan)),

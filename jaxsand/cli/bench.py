@@ -10,6 +10,8 @@ from typing import Any
 from jaxsand.cli.files import folder, progress, write_json, written
 from jaxsand.cli.printing import show
 
+_STROKE_GOALS = ("letters", "turned", "rough", "eight")
+
 
 def run_benchmark(options: argparse.Namespace) -> None:
     tell = progress()
@@ -80,16 +82,23 @@ def _device_for_each_core() -> None:
 
 
 def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
-    """The options of `bench strokes`, of which other benches have none."""
-    if options.what != "strokes":
+    """The options of `bench strokes` and of `bench tasks`, of which other benches have none."""
+    if options.what not in ("strokes", "tasks"):
         for option in ("goals", "calls", "seeds", "methods"):
             if getattr(options, option) is not None:
-                raise ValueError(f"{option}: has an effect on bench strokes only; leave it out")
+                raise ValueError(f"{option}: has an effect on bench strokes and bench tasks only; leave it out")
         return {}
+    methods = tuple(name.strip() for name in options.methods.split(",")) if options.methods else ()
+    if options.what == "tasks":
+        names = tuple(name.strip() for name in options.goals.split(",")) if options.goals else ()
+        given = {"names": names, "methods": methods, "instances": options.seeds, "pushes": options.calls}
+        return {name: value for name, value in given.items() if value}
+    if options.goals not in (None, *_STROKE_GOALS):
+        raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(_STROKE_GOALS)}")
     return {
         "goals": options.goals or "letters",
         "calls": options.calls or 4_000,
         "seeds": tuple(range(options.seed, options.seed + (options.seeds or 1))),
-        "methods": tuple(name.strip() for name in options.methods.split(",")) if options.methods else (),
+        "methods": methods,
         "out": options.out,
     }

@@ -159,10 +159,14 @@ def _bench(commands: Any) -> None:
     )
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
     p.add_argument("--seed", type=seed, default=0, metavar="K", help="of the searches on sand, the first for strokes (0)")
-    p.add_argument("--seeds", type=count, metavar="N", help="strokes: how many seeds from that one on (1)")
-    p.add_argument("--calls", type=count, metavar="N", help="strokes: calls of the simulator (4000)")
-    p.add_argument("--goals", choices=["letters", "turned", "rough", "eight"], help="strokes: (letters)")
-    p.add_argument("--methods", metavar="A,B", help="strokes: methods by name (all)")
+    p.add_argument(
+        "--seeds", type=count, metavar="N", help="strokes, tasks: how many seeds, or instances, from that one on (1)"
+    )
+    p.add_argument("--calls", type=count, metavar="N", help="calls of the simulator (strokes: 4000; tasks: 500)")
+    p.add_argument(
+        "--goals", metavar="A,B", help="strokes: letters, turned, rough, or eight (letters); tasks: by name (all)"
+    )
+    p.add_argument("--methods", metavar="A,B", help="strokes, tasks: methods by name (all)")
     p.add_argument(
         "--out", type=path_name, metavar="DIR", help="folder for the report and its figure; strokes goes on there"
     )
