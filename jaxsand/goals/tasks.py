@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.path import Path as Outline
 
 from jaxsand.goals.goal import Goal
 from jaxsand.goals.metrics import iou
@@ -295,8 +294,17 @@ def _at_rest(rng: np.random.Generator, name: str, steps: list[tuple[np.ndarray, 
     places = np.stack([x.ravel() for x in _places(scene)], 1)
     shape = _flat(scene).astype(float)
     for corners, depth in steps:
-        shape[Outline(corners + move).contains_points(places).reshape(shape.shape)] = -depth
+        shape[_within(corners + move, places).reshape(shape.shape)] = -depth
     return _dig(scene, name, shape, 24, rest)
+
+
+def _within(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Which places [n, 2] lie within a polygon of corners [m, 2]: rays from them cross its sides an odd number of times."""
+    (x0, y0), (x1, y1) = corners.T[:, :, None], np.roll(corners, -1, axis=0).T[:, :, None]
+    x, y = places.T[:, None]
+    crosses = (y0 > y) != (y1 > y)
+    at = x0 + (y - y0) * (x1 - x0) / np.where(crosses, y1 - y0, 1)
+    return (crosses & (x < at)).sum(0) % 2 == 1
 
 
 def _dig(scene: Scene, name: str, shape: Map, strokes: int, rest: bool = True) -> Task:

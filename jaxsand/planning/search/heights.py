@@ -70,15 +70,16 @@ def best_coverage(job: Job, budget: float) -> tuple[Ended, Effort]:
             break
         plans.append(plan)
         cost += len(plan)
-    most = max(map(len, plans), default=0)
-    if not most:
+    if not cost:
         return (np.zeros((0, 6)), float(distance(job.height, job.goal))), Effort()
-    high = float(job.height.max()) + 1.0
-    spare = np.array([0.0, 0.0, high, float(job.scene.grid.spacing), 0.0, high])  # in the air, which changes nothing
-    filled = np.stack([np.concatenate([plan, np.repeat(spare[None], most - len(plan), axis=0)]) for plan in plans])
-    ends = distance(finish(job.scene, filled, 0, job.height[None]), job.goal)
-    rows, best = np.unravel_index(int(ends.argmin()), ends.shape)
-    return (plans[best][:rows], float(ends.min())), Effort(full=cost)
+    maps = np.repeat(job.height[None], len(plans), axis=0)
+    ends = [distance(maps, job.goal)]
+    for k in range(max(map(len, plans))):
+        some = [i for i, plan in enumerate(plans) if len(plan) > k]
+        maps[some] = pushed(job.scene, maps[some], np.stack([plans[i][k] for i in some]))
+        ends.append(distance(maps, job.goal))
+    rows, best = np.unravel_index(int(np.argmin(ends)), (len(ends), len(plans)))
+    return (plans[best][:rows], float(np.min(ends))), Effort(full=cost)
 
 
 def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[Ended, Effort]:
