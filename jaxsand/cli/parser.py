@@ -83,6 +83,13 @@ def _shape(commands: Any) -> None:
     p.add_argument("--cells", type=count, help="grid cells along the longer side of a .png or terrain (48)")
     p.add_argument("--first-row", choices=["bottom", "top"], help="where the first row of .npy files lies (bottom: y = 0)")
     p.add_argument("--no-data", type=number, metavar="V", help=_NO_DATA)
+    p.add_argument(
+        "--free",
+        type=path_name,
+        metavar="MASK",
+        help="search, optimise, policy: cells of a .npy goal where any height will do, as its NaN cells: a .png (dark is "
+        "free; first row on top) or a .npy of booleans (first row at y = 0)",
+    )
     p.add_argument("--out", type=path_name, metavar="DIR", help="folder to write to (shape-GOAL)")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_shape)
@@ -179,7 +186,8 @@ _GOAL = (
     "(first row at the bottom, y = 0; see --first-row), or terrain"
 )
 _NO_DATA = (
-    "what .npy files hold where nothing is known (-9999, ...); such cells are named and refused, not taken for heights"
+    "what .npy files hold where nothing is known (-9999, ...); a goal of search, optimise or policy is free in such cells, "
+    "else they are refused"
 )
 _METHODS = (
     "plan: a shortest path; optimise: strokes by gradients through the sand; policy: what a network learned; "

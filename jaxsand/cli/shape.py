@@ -88,6 +88,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
 _ROWS = "heights in metres, first row at y = 0; with --first-row top, on top as in pictures and maps"
 _OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".json", ".npz", ".svg", ".tif", ".tiff")
 _REFINED = 4000  # pushes by --refine, unless told otherwise
+_DARK = 0.5  # of black: what a picture's free cells are darker than
 _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
 
 _BY = {
@@ -96,6 +97,7 @@ _BY = {
     "seed": ("search", "optimise"),
     "lookahead": ("policy",),
     "refine": ("policy",),
+    "free": ("search", "optimise", "policy"),
 }
 
 
@@ -110,6 +112,8 @@ def _check_options(options: argparse.Namespace) -> None:
             Path(file).suffix.lower() for file in (options.goal, options.surface)
         }:
             raise ValueError(f"{option.replace('_', '-')}: has an effect on .npy files only; leave it out")
+    if options.free is not None and Path(options.goal).suffix.lower() != ".npy":
+        raise ValueError("free: has an effect on a goal in a .npy file only; leave it out")
     if options.method == "policy" and options.pushes and not options.refine:
         raise ValueError("pushes: has an effect on the policy with --refine only; add that, or leave it out")
 
@@ -227,10 +231,52 @@ def _surface_target(options: argparse.Namespace) -> "Target":
         layout = _layout(options, _DEEP)
         heights = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
     else:
-        heights = _heights(path, "goal", options)
+        heights = _goal_heights(path, options)
         layout = _layout(options, _DEEP if planned else _deep_enough(heights, options.method))
     make = pipeline.height_target if planned else pipeline.height_goal
     return make(heights, "terrain" if name == "terrain" else "heights", path.stem, layout)
+
+
+def _goal_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
+    """A goal's heights, NaN where it is free: where the file has none or holds the value for no data, or by --free."""
+    import numpy as np
+
+    from jaxsand.goals.letters import read_heights
+
+    if options.method == "plan":
+        try:
+            return _heights(path, "goal", options)
+        except ValueError as error:
+            if "not finite" not in str(error):
+                raise
+            raise ValueError(f"{error}; or use --method search or optimise, to which they are free") from None
+    heights = read_heights(existing(path), options.no_data).astype(float)
+    heights = heights[::-1] if options.first_row == "top" else heights
+    return heights if options.free is None else np.where(_free(Path(options.free), heights.shape), np.nan, heights)
+
+
+def _free(path: Path, shape: tuple[int, ...]) -> "np.ndarray":
+    """The free cells of a mask: the dark ones of a picture, or those of a .npy that are not 0; row 0 at y = 0."""
+    import numpy as np
+
+    from jaxsand.goals.letters import read_image
+
+    if path.suffix.lower() == ".png":
+        mask = read_image(existing(path)) < -_DARK
+    elif path.suffix.lower() == ".npy":
+        existing(path)
+        try:
+            mask = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError):
+            raise ValueError(f"free: {path} cannot be read as a .npy array; save one with numpy.save") from None
+        if mask.dtype.kind not in "biuf":
+            raise ValueError(f"free: got dtype {mask.dtype} in {path}; save booleans")
+        mask = mask != 0
+    else:
+        raise ValueError(f"free: got {str(path)!r}; give a .png (dark is free) or a .npy of booleans")
+    if mask.shape != shape:
+        raise ValueError(f"free: got shape {list(mask.shape)}, the goal has {list(shape)}; make them equal")
+    return mask
 
 
 def _heights(path: Path, field: str, options: argparse.Namespace) -> "np.ndarray":
@@ -249,13 +295,15 @@ def _drawn(options: argparse.Namespace) -> ValueError:
 
 def _dug_alone(target: "Target") -> str:
     """What else to do about a goal that only digs."""
-    digs = target.goal.min() < 0 >= target.goal.max()
+    import numpy as np
+
+    digs = not (target.goal > 0).any() and not np.isnan(target.goal).any() and bool((target.goal < 0).any())
     return ", or use --method plan, which compares only what is dug" if digs else ""
 
 
 def _deep_enough(heights: "np.ndarray", method: str) -> float:
     """The depth (mm) of a blade that digs a goal and no deeper: one that only levels and heaps scrapes at height 0."""
-    depth = 1e3 * max(0.0, -float(heights.min()))
+    depth = -1e3 * float(min(0.0, *heights[heights < 0].ravel(), 0.0))
     return _DEEP if method == "policy" and not depth else min(depth, _DEEP)
 
 

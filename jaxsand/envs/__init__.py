@@ -26,6 +26,7 @@ from jaxsand.envs.multi import (
     Stop,
     StrokeParams,
     StrokeState,
+    Weighted,
     WithBerms,
 )
 from jaxsand.envs.onmap import MapParams, MapState, OnMap
@@ -76,6 +77,7 @@ __all__ = [
     "StrokeState",
     "Together",
     "Walks",
+    "Weighted",
     "WithBerms",
     "library",
     "make",

@@ -10,7 +10,7 @@ import numpy as np
 from jaxsand.envs.excavate import Excavate
 from jaxsand.envs.heights import Heights, OwnDepth
 from jaxsand.envs.maps import MapGoals
-from jaxsand.envs.multi import LevelGoals, MultiStroke, NoStop, OnlyDug, RoughGoals, Stop, WithBerms
+from jaxsand.envs.multi import LevelGoals, Measure, MultiStroke, NoStop, RoughGoals, Stop
 from jaxsand.envs.onmap import OnMap
 from jaxsand.envs.onsand import OnSand
 from jaxsand.envs.pushing import Batching, Push
@@ -27,7 +27,7 @@ _KINDS: dict[str, Any] = {
     "on": OnMap | OnSand,
     "push": Push,
     "stop": NoStop | Stop,
-    "measure": WithBerms | OnlyDug,
+    "measure": Measure,
     "batching": Batching,
     "settle": StopRule | None,
     "heights": OwnDepth | Heights,

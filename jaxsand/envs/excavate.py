@@ -9,11 +9,10 @@ import jax.numpy as jnp
 from jaxsand.envs import episode
 from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.heights import Heights, off_map, on_map
-from jaxsand.envs.multi import LevelGoals, NoStop, OnlyDug, RoughGoals, Stop, WithBerms
+from jaxsand.envs.multi import LevelGoals, Measure, NoStop, RoughGoals, Stop, WithBerms
 from jaxsand.envs.pushing import Batching, ByLength, Pushing
 from jaxsand.envs.spaces import Box, Dict
 from jaxsand.envs.zones import NoZones, Told, Zones, kept
-from jaxsand.goals import metrics
 from jaxsand.interaction.bucket import bucket_of, dump, scoop
 from jaxsand.interaction.load import Load, as_load
 from jaxsand.interaction.stepped import SteppedPush
@@ -102,7 +101,7 @@ class Excavate:
     Args:
       push: `SteppedPush()`: how finely the bucket's edge moves.
       stop: `NoStop()` or `Stop()`.
-      measure: `WithBerms()` or `OnlyDug()`.
+      measure: `WithBerms()`, `OnlyDug()` or `Weighted(above, below)`.
       batching: `ByLength()` (for a CPU, the default) or `Together()` (for a GPU).
       settle: when settling stops; None means when the sand is still.
       heights: the heights of the bucket's edge, as multiples of its depth.
@@ -122,7 +121,7 @@ class Excavate:
 
     push: SteppedPush = field(default_factory=SteppedPush)
     stop: NoStop | Stop = field(default_factory=NoStop)
-    measure: WithBerms | OnlyDug = field(default_factory=WithBerms)
+    measure: Measure = field(default_factory=WithBerms)
     batching: Batching = field(default_factory=ByLength)
     settle: StopRule | None = None
     heights: Heights = field(default_factory=Heights)
@@ -174,8 +173,8 @@ class Excavate:
         return after, outcome, told
 
     def distance(self, state: ExcavateState, params: ExcavateParams) -> jax.Array:
-        """L, a scalar: the l2 distance of goal and map as measured, in units of the bucket's depth (float32)."""
-        far = metrics.l2(self.measure.seen(state.goal), self.measure.seen(state.height))
+        """L, a scalar: the distance of goal and map as measured, in units of the bucket's depth (float32)."""
+        far = self.measure.distance(state.goal, state.height)
         return (far / bucket_of(params.scene).depth).astype(jnp.float32)
 
     def dig(self, action: jax.Array, params: ExcavateParams) -> jax.Array:

@@ -152,8 +152,8 @@ class MultiStrokeEnv(_Sand):
     numbers beyond that push from off the map. With `heights=Heights()`, the default of the second name, it holds x0, y0, z0,
     x1, y1, z1.
 
-    The reward is L_t - L_{t+1}, with L = sqrt(sum (goal - h)^2). It depends on the map before the push, which is in
-    info["previous"]. So an algorithm that relabels goals must keep the infos (Stable-Baselines3:
+    The reward is L_t - L_{t+1}, with L the distance by `measure`, by default sqrt(sum (goal - h)^2). It depends on the map
+    before the push, which is in info["previous"]. So an algorithm that relabels goals must keep the infos (Stable-Baselines3:
     replay_buffer_kwargs={"copy_info_dict": True}).
 
     Args:
@@ -223,9 +223,7 @@ class MultiStrokeEnv(_Sand):
         return given.reshape(count, rows, columns)
 
     def _distance(self, goal: np.ndarray, maps: np.ndarray) -> np.ndarray:
-        seen = self.core.measure.seen
-        apart = np.asarray(seen(goal), float) - np.asarray(seen(maps), float)
-        return np.sqrt(np.sum(apart.reshape(len(apart), -1) ** 2, axis=1))
+        return np.asarray(self.core.measure.distance(np.asarray(goal, float), np.asarray(maps, float)))
 
 
 class ExcavateEnv(_Sand):

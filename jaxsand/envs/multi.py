@@ -1,7 +1,7 @@
 """Many strokes: each action is a straight push from anywhere to anywhere on the map, after which the sand settles."""
 
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,14 @@ from jaxsand.envs.heights import Heights, OwnDepth
 from jaxsand.envs.pushing import Batching, ByLength, Push, pushing
 from jaxsand.envs.spaces import Box, Dict
 from jaxsand.envs.zones import NoZones, Told, Zones, kept
-from jaxsand.goals import metrics
+from jaxsand.goals.goal import Goal, Power
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of
 
 Tree = TypeVar("Tree")
+Map = Any
+"""Heights [..., H, W] (m), numpy's or JAX's."""
 
 
 @dataclass(frozen=True)
@@ -64,15 +66,15 @@ class WithBerms:
     """Tells an environment to compare maps as they are, the default: for goals that strokes made.
 
     Example:
-      >>> import jax.numpy as jnp
+      >>> import numpy as np
       >>> import jaxsand as js
-      >>> float(js.env.WithBerms().seen(jnp.float32(2.0)))
+      >>> float(js.env.WithBerms().distance(np.zeros((1, 1)), np.full((1, 1), 2.0)))
       2.0
     """
 
-    def seen(self, height: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
-        """The map as it is."""
-        return height
+    def distance(self, goal: Map, height: Map) -> Map:
+        """The l2 distance [...] (m) of maps [..., H, W] from goals [..., H, W]."""
+        return Goal(goal).distance(height)
 
 
 @dataclass(frozen=True)
@@ -80,15 +82,52 @@ class OnlyDug:
     """Tells an environment to compare what is dug, min(h, 0): for goals that are drawn without berms.
 
     Example:
-      >>> import jax.numpy as jnp
+      >>> import numpy as np
       >>> import jaxsand as js
-      >>> float(js.env.OnlyDug().seen(jnp.float32(2.0)))
+      >>> float(js.env.OnlyDug().distance(np.zeros((1, 1)), np.full((1, 1), 2.0)))
       0.0
     """
 
-    def seen(self, height: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
-        """What is dug of the map."""
-        return metrics.below(height)
+    def distance(self, goal: Map, height: Map) -> Map:
+        """The l2 distance [...] (m) of what is dug of maps [..., H, W] and goals [..., H, W]."""
+        return Goal(goal * (goal < 0)).distance(height * (height < 0))
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """Tells an environment what it costs where sand stands above or below a goal; see `jaxsand.Goal`.
+
+    Args:
+      above: the weight of sand above the goal, 0 or more; with 0, heaps may lie anywhere.
+      below: the weight of sand below the goal, 0 or more.
+      power: 2 or 1.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
+      >>> measure = js.env.Weighted(above=0.0)
+      >>> [float(measure.distance(np.zeros((1, 1)), np.full((1, 1), h))) for h in (2.0, -2.0)]
+      [0.0, 2.0]
+    """
+
+    above: float = 1.0
+    below: float = 1.0
+    power: Power = 2
+
+    def __post_init__(self) -> None:
+        for name in ("above", "below"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0 <= value < np.inf):
+                raise ValueError(f"measure.{name}: got {value!r}; give a weight of 0 or more")
+        if self.power not in (1, 2):
+            raise ValueError(f"measure.power: got {self.power!r}; give 1 or 2")
+
+    def distance(self, goal: Map, height: Map) -> Map:
+        """The distance [...] (m) of maps [..., H, W] from goals [..., H, W]."""
+        return Goal(goal, self.above, self.below, self.power).distance(height)
+
+
+Measure = WithBerms | OnlyDug | Weighted
 
 
 @jax.tree_util.register_dataclass
@@ -200,7 +239,7 @@ class MultiStroke:
     or sinks evenly on the way, from -1 to 1 between heights that the blade's depth gives. Observations are the maps "goal"
     and "current" [H, W] in units of the blade's depth (float32).
 
-    With L = sqrt(sum (goal - h)^2), of the maps as `measure` sees them and in units of the blade's depth, the reward is
+    With L the distance of map and goal by `measure`, sqrt(sum (goal - h)^2), in units of the blade's depth, the reward is
     L_t - L_{t+1}. An episode is truncated after `limit` strokes, and terminated when a `Stop` asks for it. `info` holds the
     simulator's "outcome", and with zones "clipped" and "went"; see `ClippedBy`. A push that leaves a map that is not finite,
     leads straight up or down, or may not be made, counts as a stroke and leaves the map as it was.
@@ -211,7 +250,7 @@ class MultiStroke:
     Args:
       push: `SteppedPush()` (the full push, the default) or `SwathPush()` (fast).
       stop: `NoStop()` or `Stop()`.
-      measure: `WithBerms()` or `OnlyDug()`.
+      measure: `WithBerms()`, `OnlyDug()` or `Weighted(above, below)`.
       batching: `ByLength()` (for a CPU, the default) or `Together()` (for a GPU).
       settle: when settling stops; None means when the sand is still.
       heights: `OwnDepth()` (the default) or `Heights()`.
@@ -231,7 +270,7 @@ class MultiStroke:
 
     push: Push = field(default_factory=SteppedPush)
     stop: NoStop | Stop = field(default_factory=NoStop)
-    measure: WithBerms | OnlyDug = field(default_factory=WithBerms)
+    measure: Measure = field(default_factory=WithBerms)
     batching: Batching = field(default_factory=ByLength)
     settle: StopRule | None = None
     heights: OwnDepth | Heights = field(default_factory=OwnDepth)
@@ -278,8 +317,8 @@ class MultiStroke:
         return after, outcome, told
 
     def distance(self, state: StrokeState, params: StrokeParams) -> jax.Array:
-        """L, a scalar: the l2 distance of goal and map as measured, in units of the blade's depth (float32)."""
-        far = metrics.l2(self.measure.seen(state.goal), self.measure.seen(state.height))
+        """L, a scalar: the distance of goal and map as measured, in units of the blade's depth (float32)."""
+        far = self.measure.distance(state.goal, state.height)
         return (far / blade_of(params.scene).depth).astype(jnp.float32)
 
     def stroke(self, action: jax.Array, params: StrokeParams) -> jax.Array:

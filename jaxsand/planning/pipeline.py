@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.goals import metrics
+from jaxsand.goals.goal import as_goal
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import Shaped, follow_frames
 from jaxsand.interaction.stepped import SteppedPush
@@ -70,7 +71,7 @@ class Target:
       kind: what the goal was given as.
       method: what planned the strokes.
       scene: grid, sand and tool.
-      goal: [H, W] (m), row 0 at y = 0.
+      goal: [H, W] (m), row 0 at y = 0, NaN where it is free.
       paths: points [n, 2] = x, y (m) of each path; the tool is lifted between paths.
       drawn: whether the goal was drawn without berms, so that only min(h, 0) is compared.
       depth: of a trench (m).
@@ -149,11 +150,10 @@ def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -
 
 
 def height_goal(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
-    """A height map as a goal that has no strokes yet."""
-    metrics.finite(goal)
-    goal = np.asarray(goal, float)
+    """A height map as a goal that has no strokes yet; cells that are NaN are free."""
     scene = make_scene(goal.shape, layout.spacing, tool=layout.blade)
-    return Target(name, kind, "plan", scene, goal, (), bool(np.all(goal <= 0)), layout.depth)
+    goal = np.asarray(as_goal(scene, goal).height)
+    return Target(name, kind, "plan", scene, goal, (), not np.any(goal > 0), layout.depth)
 
 
 def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
@@ -170,6 +170,7 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
         raise ValueError(
             f"goal: got {list(goal.shape)} cells, fewer than the {layout.cell} of one step of the tool; give a finer goal"
         )
+    metrics.finite(goal)
     target = height_goal(goal, kind, name, layout)
     counts = [max(round(n / layout.cell), math.ceil(n / (layout.cell * layout.oversize))) for n in target.goal.shape]
     blocks = metrics.resample(target.goal, (counts[0], counts[1]))
@@ -271,11 +272,13 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
     """The figures of a result by name; see `ShapeResult`."""
 
     def reduction(view: Callable[[np.ndarray], np.ndarray]) -> float:
-        return float(metrics.l2_reduction(view(target.goal), view(before.astype(float)), view(after.astype(float))))
+        goal = view(np.where(np.isnan(target.goal), before, target.goal))
+        seen = np.where(np.isnan(target.goal), before, after).astype(float)  # what is free has nothing to be gained
+        return float(metrics.l2_reduction(goal, view(before.astype(float)), view(seen)))
 
     whole = reduction(lambda h: h)
     return {
-        "iou": float(metrics.iou(target.goal, after, target.depth)),
+        "iou": float(metrics.iou(target.goal, np.where(np.isnan(target.goal), np.nan, after), target.depth)),
         "l2_reduction": reduction(lambda h: np.minimum(h, 0)) if target.drawn else whole,
         "l2_reduction_with_berms": whole,
         "volume_error": metrics.volume_error(before, after),

@@ -252,4 +252,4 @@ def _extent(target: Target) -> tuple[float, float, float, float]:
 
 def _span(*maps: np.ndarray) -> float:
     """The largest height of some maps."""
-    return max(1e-6, *(float(np.abs(m).max()) for m in maps))
+    return max(1e-6, *(float(np.nanmax(np.abs(m))) for m in maps))

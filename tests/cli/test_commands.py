@@ -83,10 +83,32 @@ BAD = {
     "depth of none": (["shape", "S", "--depth-mm", "0"], "depth-mm: got 0.0"),
     "resolution of none": (["shape", "S", "--resolution", "0"], "resolution: got '0'"),
     "resolution beyond reason": (["shape", "S", "--resolution", "9999"], "resolution: got 9999"),
-    "goal without data": (["shape", "holes.npy", "--no-data", "-9999"], "goal: got 12 cells that are not finite; fill"),
-    "searched goal without data": (
-        ["shape", "holes.npy", "--no-data", "-9999", "--method", "search"],
-        "goal: got 12 cells that are not finite; fill",
+    "goal without data": (
+        ["shape", "holes.npy", "--no-data", "-9999"],
+        "goal: got 12 cells that are not finite; fill .*; or use --method search or optimise, to which they are free",
+    ),
+    "goal that is free": (["shape", "nan.npy", "--method", "search"], "goal: got NaN, free, in every cell"),
+    "free cells of a plan": (
+        ["shape", "dip.npy", "--free", "cube.npy"],
+        "free: has an effect with --method search, optimise",
+    ),
+    "free cells of a letter": (
+        ["shape", "S", "--method", "search", "--free", "cube.npy"],
+        r"free: has an effect on a goal in a \.npy file only",
+    ),
+    "free cells of another shape": (
+        ["shape", "dip.npy", "--method", "search", "--free", "cube.npy"],
+        r"free: got shape \[2, 2, 2\], the goal has \[12, 12\]",
+    ),
+    "free cells in words": (["shape", "dip.npy", "--method", "search", "--free", "words.npy"], "free: got dtype <U1"),
+    "free cells of nothing": (["shape", "dip.npy", "--method", "search", "--free", "none.npy"], "none.npy: no such file"),
+    "free cells of rubbish": (
+        ["shape", "dip.npy", "--method", "search", "--free", "broken.npy"],
+        r"free: broken.npy cannot be read as a \.npy array",
+    ),
+    "free cells in text": (
+        ["shape", "dip.npy", "--method", "search", "--free", "land.xyz"],
+        r"free: got 'land.xyz'; give a \.png \(dark is free\)",
     ),
     "surface without data": (
         ["shape", "dip.npy", "--no-data", "-9999", "--surface", "holes.npy"],
@@ -363,6 +385,28 @@ def test_the_policy_looks_ahead(here, capsys):
     assert ahead["search"]["after"] <= alone["search"]["after"] * (1 + 1e-5)
     assert ahead["l2_reduction"] == pytest.approx(1 - ahead["search"]["after"] / ahead["search"]["before"], abs=1e-3)
     assert ahead["iou"] > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mask", ["mask.npy", "mask.png"])
+def test_free_cells_are_those_of_a_mask_or_of_no_number(here, capsys, mask):
+    """A pit 4 mm deep, all around which is free: by NaN, by booleans, or by a picture whose first row is on top."""
+    inside = np.zeros((12, 16), bool)
+    inside[2:7, 4:12] = True
+    np.save(here / "pit.npy", np.where(inside, -0.004, np.nan))
+    np.save(here / "drawn.npy", np.where(inside, -0.004, 0))
+    np.save(here / "mask.npy", ~inside)
+    Image.fromarray(np.where(inside, 255, 0).astype(np.uint8)[::-1]).save(here / "mask.png")
+    search = ["--method", "search", "--strokes", "2", "--pushes", "20", "--json", "--out", "out"]
+    reports = []
+    for goal in (["pit.npy"], ["drawn.npy", "--free", mask]):
+        assert main(["shape", *goal, *search]) == 0
+        reports.append(json.loads(capsys.readouterr().out))
+    assert reports[0]["strokes"] == reports[1]["strokes"]
+    assert reports[0]["search"]["before"] == pytest.approx(0.004 * inside.sum() ** 0.5)
+    assert reports[0]["l2_reduction"] == pytest.approx(
+        1 - reports[0]["search"]["after"] / reports[0]["search"]["before"], abs=1e-3
+    )
 
 
 @pytest.mark.slow

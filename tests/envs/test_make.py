@@ -63,7 +63,14 @@ def test_only_what_is_dug_counts_for_drawn_goals():
     drawn = np.zeros((1, 16, 16), np.float32)
     drawn[0, 6:10, 6:10] = -0.0075
     berms = jnp.asarray(drawn[0]).at[2].set(0.004)
-    for measure, far in ((envs.OnlyDug(), 0.0), (envs.WithBerms(), 4 * 0.004 / 0.0075)):
+    measures = (
+        (envs.OnlyDug(), 0.0),
+        (envs.WithBerms(), 4 * 0.004 / 0.0075),
+        (envs.Weighted(above=0.25), 2 * 0.004 / 0.0075),
+        (envs.Weighted(above=0.25, power=1), 4 * 0.004 / 0.0075),
+        (envs.Weighted(above=0.0), 0.0),
+    )
+    for measure, far in measures:
         env, params = small(goals=drawn, measure=measure)
         _, state = env.reset(KEY, params)
         assert float(env.distance(replace(state, height=berms), params)) == pytest.approx(far)
