@@ -153,8 +153,8 @@ class MultiStrokeEnv(_Sand):
     x1, y1, z1.
 
     The reward is L_t - L_{t+1}, with L the distance by `measure`, by default sqrt(sum (goal - h)^2). It depends on the map
-    before the push, which is in info["previous"]. So an algorithm that relabels goals must keep the infos (Stable-Baselines3:
-    replay_buffer_kwargs={"copy_info_dict": True}).
+    before the push, which is in info["previous"]. So an algorithm that relabels goals must keep the infos (of
+    Stable-Baselines3: replay_buffer_kwargs={"copy_info_dict": True}).
 
     Args:
       render_mode: "rgb_array" or None.
