@@ -64,6 +64,12 @@ def test_the_nearest_map_costs_nothing_and_free_cells_keep_their_sand():
     assert np.isnan(goal.off(np.full(SHAPE, np.nan))).all()  # what is not finite is not hidden by a free cell
 
 
+def test_what_is_no_number_costs_nothing():
+    goal = Goal(np.array([[np.nan, 0.0]]))
+    assert goal.cost(np.array([[1.0, 2.0]])) == goal.cost(jnp.array([[1.0, 2.0]])) == 4.0
+    assert jax.grad(goal.cost)(jnp.array([[1.0, 2.0]])).tolist() == [[0.0, 4.0]]
+
+
 def test_a_masked_goal_is_a_free_one():
     masked = np.ma.masked_array(HEIGHT, mask=HEIGHT > 0)
     np.testing.assert_array_equal(as_goal(SCENE, masked).free, HEIGHT > 0)

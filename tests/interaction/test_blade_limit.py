@@ -71,7 +71,6 @@ def test_the_result_goes_to_a_limit_with_the_sub_step():
     assert apart[1] < 0.015
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("neighbours", [8, pytest.param("isotropic", marks=pytest.mark.slow)])
 def test_a_turn_sweeps_and_does_not_depend_on_its_parts(neighbours):
     sand = square(32, neighbours, tool=js.Blade(width=0.1, thickness=0.015, depth=0.0075))
