@@ -45,6 +45,14 @@ def test_a_stroke_ends_at_the_edge_of_a_zone(make):
     assert (bool(backwards[2]["clipped"]), float(backwards[2]["went"])) == (False, 1)
 
 
+def test_what_rises_ends_as_high_as_it_is_at_the_edge():
+    stroke = np.insert(np.asarray(THROUGH), [2, 4], [-0.01, 0.0])
+    made, told = envs.ClippedBy(RIGHT).way(jnp.asarray(stroke), SMALL.grid, SMALL.tool.width, SMALL.tool.thickness)
+    share = (EDGE - 0.03) / 0.1
+    assert float(told["went"]) == pytest.approx(share, abs=1e-5)
+    np.testing.assert_allclose(made, [0.03, 0.055, -0.01, EDGE, 0.055, -0.01 + 0.01 * share], atol=1e-6)
+
+
 def test_what_begins_at_the_edge_of_a_zone_stays_out_of_it():
     """Where the last stroke was clipped, the next has hardly any way left, too short for floats to tell its heading."""
     zone = np.zeros((32, 32), bool)
