@@ -23,7 +23,7 @@ RIVALS: dict[str, Method] = {
     "coverage": earth.coverage_paths,
     "least work": earth.transported,
 }
-SEARCH, GRADIENTS = "plan_sand", "plan_sand, then gradients"
+SEARCH, GRADIENTS = "plan_sand", "plan_sand and gradients"
 METHODS = (*RIVALS, SEARCH, GRADIENTS)
 
 

@@ -1,0 +1,52 @@
+"""The bench of earth-moving tasks: what it tells, and its options."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jaxsand.__main__ import main
+from jaxsand.bench import tasks
+from jaxsand.bench.tasks import METHODS, bench_tasks
+from jaxsand.goals.tasks import figures, make_task
+
+
+@pytest.mark.slow
+def test_rows_tell_what_methods_leave_and_spend():
+    rows = bench_tasks(names=("rectangle",), methods=METHODS, pushes=120)
+    assert [row["method"] for row in rows] == [*METHODS]
+    for row in rows:
+        assert row["before_mm"] > row["mean_mm"] == row["worst_mm"] or row["method"] == "random"
+        assert 0 < row["pushes"] <= 120
+        assert 0 < row["strokes"] <= 24
+        assert row["path_m"] > 0.01 * row["strokes"]
+        assert row["moved"] > 0
+    left = {row["method"]: row["distance"] for row in rows}
+    assert left["plan_sand"] <= min(left["least work"], left["random"])
+
+
+def test_doing_nothing_is_told_as_that(monkeypatch):
+    monkeypatch.setitem(tasks.RIVALS, "random", lambda *_: ((np.zeros((0, 6)), 0.0), tasks.Effort()))
+    (row,) = bench_tasks(names=("ring",), methods=("random",), instances=2)
+    means = [figures(make_task("ring", key), make_task("ring", key).start)["mean_mm"] for key in (0, 1)]
+    assert row["mean_mm"] == row["before_mm"] == pytest.approx(np.mean(means))
+    assert row["worst_mm"] == pytest.approx(max(means))
+    assert (row["strokes"], row["path_m"], row["moved"], row["coverage"]) == (0, 0, 0, None)
+
+
+def test_names_that_do_not_exist_are_refused():
+    with pytest.raises(ValueError, match="bench tasks: got 'dance'; give some of level, pad"):
+        bench_tasks(names=("dance",))
+    with pytest.raises(ValueError, match="bench tasks: got 'luck'; give some of random, coverage"):
+        bench_tasks(methods=("luck",))
+
+
+def test_the_command_passes_its_options_on(monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr(tasks, "bench_tasks", lambda tell, **given: asked.append(given) or [{"task": "pad", "mean_mm": 1.0}])
+    given = ["--goals", "pad,ramp", "--methods", "coverage", "--calls", "7", "--seeds", "2", "--seed", "3"]
+    assert main(["bench", "tasks", *given, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["tasks"] == [{"task": "pad", "mean_mm": 1.0}]
+    assert asked == [{"seed": 3, "names": ("pad", "ramp"), "methods": ("coverage",), "instances": 2, "pushes": 7}]
+    assert main(["bench", "strokes", "--goals", "pad"]) == 2
+    assert "goals: got 'pad'; give one of letters, turned" in capsys.readouterr().err
