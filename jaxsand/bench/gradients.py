@@ -63,9 +63,11 @@ def bench_grad(
     cells: int = 32,
     batch: int = 64,
     rounds: int = _ROUNDS,
+    tools: tuple[Case, ...] = TOOLS,
 ) -> dict[str, list[Row]]:
-    """Costs, errors, errors against run time when settling stops early, and what strokeloss.GRADIENT stands for, on `batch`
-    maps of `cells` a side. With `larger`, costs also on so many of these, and on a 64th as many of 160 x 160."""
+    """Costs, errors (of every tool too), errors against run time when settling stops early, and what strokeloss.GRADIENT
+    stands for, on `batch` maps of `cells` a side. With `larger`, costs also on so many of these, and on a 64th as many of
+    160 x 160."""
     sizes = ((cells, batch),) + (((cells, larger), (160, max(1, larger // 64))) if larger else ())
     early = tuple(case for case in cases if case in (Case(False), Case(True)))
     return {
@@ -73,6 +75,7 @@ def bench_grad(
         "gradient_of_plans": multiples(tell, plans, cells=cells, rounds=rounds),
         "gradient_stopped_early": stopped_early(tell, early, stops, cells, batch, rounds),
         "gradient_error": accuracy(tell, cases, batch, cells),
+        "gradient_of_tools": accuracy(tell, tools, batch, min(cells, 24)),
     }
 
 
