@@ -1,0 +1,69 @@
+"""Plans as waypoints that a robot, or another simulator, can replay."""
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxsand.scene.scene import Scene
+from jaxsand.scene.tools import Blade, Bucket
+
+FIELDS = ("x", "y", "z", "lifted")
+
+
+def waypoints(scene: Scene, paths: Sequence[np.ndarray], clear: float) -> np.ndarray:
+    """The places [n, 4] = x, y, z (m), lifted (0 or 1) of the middle of the tool's bottom, in order, for paths one by one.
+
+    Before and after each path there is a point straight above its end, at the height `clear`, which is lifted; so the way
+    from one path to the next leads through the air.
+
+    Args:
+        scene: the scene, with a blade or a bucket, whose depth is that of paths without heights.
+        paths: points [k, 2] = x, y or [k, 3] = x, y, z (m) of each path, such as `plan_sand(...).paths`.
+        clear: a height (m) at which the tool touches no sand.
+
+    Raises:
+        ValueError: for a tool without a depth where a path has no heights, or a height above `clear`.
+
+    Example:
+        >>> import numpy as np
+        >>> import jaxsand as js
+        >>> from jaxsand.planning.waypoints import waypoints
+        >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade(depth=0.005))
+        >>> waypoints(scene, [np.array([[0.02, 0.04], [0.06, 0.04]])], clear=0.05)[:, 2:].tolist()
+        [[0.05, 1.0], [-0.005, 0.0], [-0.005, 0.0], [0.05, 1.0]]
+    """
+    found = []
+    for path in paths:
+        points = np.asarray(path, float)
+        if points.shape[1] == 2:
+            if not isinstance(scene.tool, Blade | Bucket):
+                raise ValueError(
+                    f"scene.tool: got {type(scene.tool).__name__}, which has no depth; give paths [n, 3] = x, y, z"
+                )
+            points = np.column_stack([points, np.full(len(points), -float(scene.tool.depth))])
+        if not points[:, 2].max() <= clear:
+            raise ValueError(
+                f"clear: got {clear}; give a height of at least {points[:, 2].max():.6g}, the highest of a path"
+            )
+        above = [[*points[end, :2], clear, 1.0] for end in (0, -1)]
+        found += [above[0], *np.column_stack([points, np.zeros(len(points))]).tolist(), above[1]]
+    return np.array(found).reshape(-1, len(FIELDS))
+
+
+def write_waypoints(file: Path, places: np.ndarray) -> None:
+    """Writes waypoints [n, 4] as .csv, with a line of names first, or as .json, a list of objects; lengths are in metres.
+
+    Raises:
+        ValueError: for another kind of file.
+    """
+    rows = [[*map(float, place[:3]), bool(place[3])] for place in places]
+    if file.suffix == ".json":
+        file.write_text(json.dumps([dict(zip(FIELDS, row, strict=True)) for row in rows], indent=1) + "\n", encoding="utf-8")
+    elif file.suffix == ".csv":
+        with file.open("w", newline="", encoding="utf-8") as out:
+            csv.writer(out).writerows([FIELDS, *([*row[:3], int(row[3])] for row in rows)])
+    else:
+        raise ValueError(f"file: got {str(file)!r}; give a name that ends in .csv or .json")
