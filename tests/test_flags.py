@@ -56,7 +56,7 @@ def test_a_fault_of_the_users_own_is_still_found():
         jnp.float32(1) + jnp.arange(2, dtype=jnp.int32)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("kind", [pytest.param(PLAIN, marks=SLOW), DRAINED, pytest.param(ISOTROPIC, marks=SLOW)])
 def test_settling(kind):
     sand = scene(kind)
@@ -111,7 +111,7 @@ def begun():
     return lambda action: env.step(jax.random.key(1), state, action, params)[2]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_environments_trace():
     reward, actions = begun(), jnp.zeros((3, 4), jnp.float32)
     jax.eval_shape(jax.vmap(jax.value_and_grad(reward)), actions)

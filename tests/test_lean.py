@@ -39,7 +39,7 @@ def test_a_scene_without_a_tool_or_window_holds_no_code_for_them():
     assert window > blade
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_window_costs_its_share_of_a_sub_step():
     """XLA counts a loop's body once, so the flops of a push are those of lowering and one sub-step."""
 
@@ -64,7 +64,7 @@ def test_six_calls_of_two_kinds_and_three_angles_trace_twice():
             run(jax.tree.map(lambda x: jnp.asarray(x, "float32"), js.make_scene((8, 8), 0.01, angle, neighbours)), h)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_public_functions_trace_once_whatever_kind_of_number_is_given():
     from jaxsand.interaction import simulate as sim
     from jaxsand.relaxation import settling

@@ -62,8 +62,8 @@ LONG = ("environments.md", "landing-pad.md", "pit-and-heap.md", "sampling-trench
 
 
 def marked(path):
-    """A page by its marks: those that compile many programs are slow."""
-    return pytest.param(path, marks=pytest.mark.slow if path.name in LONG else ())
+    """A page by its marks: those that compile many programs are for the wide tests."""
+    return pytest.param(path, marks=pytest.mark.wide if path.name in LONG else ())
 
 
 @pytest.mark.parametrize("path", [marked(path) for path in runnable(slow=False)], ids=named)

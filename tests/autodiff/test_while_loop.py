@@ -11,7 +11,7 @@ from jaxsand.autodiff.while_loop import Plain, repeat, repeat_until
 from ..conftest import ANGLE
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("bound", [1, 7, 100])
 def test_the_loop_stops_where_told_and_is_differentiated_as_its_steps(bound):
     """x <- p x + sin(x) / 10 until x > 3, against the same steps written out."""
@@ -44,7 +44,7 @@ def test_the_loop_stops_where_told_and_is_differentiated_as_its_steps(bound):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("count", [0, 5, 16, 17, 100, 777])
 def test_long_loops_restore_what_the_tape_lost(count):
     """x <- p x (1 - x), where every step's derivative differs, against the same steps in a scan; lanes of unequal length."""

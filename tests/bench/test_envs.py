@@ -30,7 +30,7 @@ print(*(f"{row['name']};{row['batch']};{row['steps_per_second'] > 0}" for row in
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("kinds", [("walk on a map",), pytest.param(KINDS, marks=pytest.mark.slow)])
 def test_every_way_has_a_rate_and_is_set_against_gymnasium(kinds):
     rows = bench_env(8, kinds=kinds)

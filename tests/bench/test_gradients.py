@@ -28,7 +28,7 @@ def check_numbers(report):
             assert all(isinstance(v, str) or math.isfinite(v) for v in row.values()), row
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_figures_make_sense(report):
     check_numbers(report)
     (cost,) = report["gradient_cost"]
@@ -55,7 +55,7 @@ def test_the_whole_bench():
     assert [row["stop"] for row in report["gradient_stopped_early"]] == ["tolerance 0.1", "16 sweeps"]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_command_prints_them(report, monkeypatch, capsys, tmp_path):
     larger = []
     monkeypatch.setattr(gradbench, "bench_grad", lambda tell, batch: larger.append(batch) or report)

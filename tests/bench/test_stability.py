@@ -21,7 +21,7 @@ def telling(case):
     return usual(case) and case.neighbours == 8 and any(name in case.name for name in names)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("only", "least"), [(telling, 20), pytest.param(usual, 60, marks=pytest.mark.slow)])
 def test_hard_numbers(only, least):
     """By the default scheme; another slow test takes the others too."""

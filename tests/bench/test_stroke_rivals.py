@@ -89,7 +89,7 @@ def bar():
     return stroke_goal("bar", np.array([[0.1, 0.15, 0.2, 0.15], [0.15, 0.1, 0.15, 0.2]]))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_many_plans_at_once_leave_what_the_simulator_leaves(bar):
     loss = sand_loss(bar.scene, bar.start, bar.goal)
     low, high = loss.bounds
@@ -113,13 +113,13 @@ def test_a_push_that_touches_its_window_is_pushed_again_on_the_whole_map(bar, mo
     np.testing.assert_allclose(after, bar.goal, atol=5e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_plan_that_is_not_finite_is_infinitely_far(bar):
     loss = sand_loss(bar.scene, bar.start, bar.goal)
     assert np.isinf(loss(np.full((1, 2, 4), np.nan)))[0]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_bench_writes_what_it_computes_and_does_not_compute_it_again(bar, tmp_path):
     methods = {"random shooting": random_shooting}
     rows = run_all(methods, [bar], (4, 16), (0, 1), tmp_path)
@@ -151,7 +151,7 @@ def test_the_bench_writes_what_it_computes_and_does_not_compute_it_again(bar, tm
     assert len(strokes_figure(rows, 0.8).axes) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch):
     def short(evaluate, n_strokes, bounds, budget, seed):
         return random_shooting(evaluate, n_strokes, bounds, min(budget, 16), seed)

@@ -7,7 +7,7 @@ import pytest
 from jaxsand.bench.timing import race
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_ways_take_turns_and_the_first_call_is_told_apart():
     calls = []
 

@@ -281,7 +281,7 @@ def test_plan_with_an_end_turns_and_a_picture(here, capsys):
 GOALS_WITHOUT_A_BINARY_PLAN = {"level": 0.0, "mound": 0.01, "shallow trench": -0.003}
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("method", ["search", "optimise"])
 @pytest.mark.parametrize("name", GOALS_WITHOUT_A_BINARY_PLAN)
 def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypatch, name, method):
@@ -352,7 +352,7 @@ def test_search_on_real_sand(here, capsys):
     assert all((here / file).exists() for file in report["files"])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_policy_trenches_a_letter(here, capsys):
     assert main(["shape", "U", "--method", "policy", "--out", "alone", "--json"]) == 0
     alone = json.loads(capsys.readouterr().out)
@@ -409,7 +409,7 @@ def test_free_cells_are_those_of_a_mask_or_of_no_number(here, capsys, mask):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     "goal", ["dip.npy", "7", *(pytest.param(name, marks=pytest.mark.slow) for name in ("white-S.png", "terrain"))]
 )
@@ -451,7 +451,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["result.json"]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_pictures_do_not_depend_on_the_users_matplotlib(tmp_path):
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\nimage.origin: lower\n")
     (tmp_path / "map.txt").write_text("###\n#.#\n")

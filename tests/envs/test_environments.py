@@ -27,7 +27,7 @@ def batch(env, params, count):
     return keys, obs, state, actions
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @each
 def test_spaces_hold_and_one_is_as_many(make):
     env, params = make()
@@ -46,7 +46,7 @@ def test_spaces_hold_and_one_is_as_many(make):
     chex.assert_trees_all_close(eager, jax.tree.map(lambda x: x[0], many), atol=2e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @each
 def test_a_new_episode_begins_where_one_ended(make):
     env, params = make()
@@ -89,7 +89,7 @@ def test_rewards_add_up_to_what_was_gained(make):
     assert begun != float(measure(state))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @each
 def test_numbers_never_retrace(make):
     env, params = make()
@@ -155,7 +155,7 @@ def test_the_angle_of_repose_may_differ_from_one_environment_to_the_next():
     assert len(np.unique(np.asarray(many[2]).round(4))) == 5
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(("size", "chunk"), [(7, 2), (1, 4), (5, 8)])
 def test_sorting_a_batch_changes_no_map(size, chunk):
@@ -175,7 +175,7 @@ def test_sorting_a_batch_changes_no_map(size, chunk):
     chex.assert_trees_all_close(seeds, expected)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 def test_a_batch_by_length_is_its_maps():
     push = ByLength(2).batched(pushing(QUICK, js.Sweeps(8)))
@@ -190,7 +190,7 @@ def test_a_batch_by_length_is_its_maps():
         assert int(code) == int(outcome[i])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_fast_push_digs_too():
     env, params = small(push=js.SwathPush(), limit=jnp.array(2))
     _, state = env.reset(KEY, params)

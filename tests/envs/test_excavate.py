@@ -118,7 +118,7 @@ def test_a_stop_ends_an_episode_in_place_of_a_dig():
     assert np.array_equal(after.height, state.height)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_digs_that_a_goal_was_drawn_from_make_it():
     drawn = envs.RandomDigs(goals=2, fewest=1, most=2)
     env, pool = digging(goals=drawn, seed=5)
@@ -162,7 +162,7 @@ RIGHT = np.arange(16) >= np.full((16, 1), 9)
 THROUGH = [0.03, 0.055, -0.004, 0.13, 0.055, -0.014]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_zones_keep_the_bucket_out_and_its_sand_in():
     env, params = digging(goals=DOUBLE, zones=envs.ClippedBy(RIGHT))
     state, _, info = dug(env, params, [*THROUGH, 0.04, 0.12, 0.0])

@@ -29,7 +29,7 @@ SOLID = np.arange(6).reshape(3, 2) == 4
 WAYS = score(by_length(ByLength(2), push)), score(push)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("axes", [(0, 0, 0), (None, 0, 0), (None, 0, None), (None, None, 0)])
 def test_derivatives_are_those_of_the_push_alone(axes):
     everything = {"angle": np.linspace(0.3, 0.7, 5)}, MAPS, STROKES

@@ -73,7 +73,7 @@ def test_a_stop_ends_an_episode_in_place_of_a_push():
     assert not obs["observation"].any()
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("measure", [None, OnlyDug()])
 def test_the_reward_is_that_of_the_goal_and_works_on_a_batch(measure):
     env = multi(**({"measure": measure} if measure else {}))
@@ -127,7 +127,7 @@ def test_masks_say_where_the_walk_may_go():
         assert info["legal"]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     ("name", "options"),
     [

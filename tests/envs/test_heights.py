@@ -30,7 +30,7 @@ def test_an_action_is_a_stroke_of_six_numbers_between_the_heights():
     assert low.stroke(jnp.zeros(6), params)[2::3].tolist() == pytest.approx([-DEPTH / 2] * 2)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_stroke_is_the_simulators():
     env, params = rising()
     _, state = env.reset(KEY, params)

@@ -38,7 +38,7 @@ def test_a_glyphs_own_strokes_make_it():
     assert np.abs(np.asarray(whole) - np.asarray(params.goals.goals[0])).max() < 1e-6  # as the simulator has it
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_rough_starts_are_at_rest_and_their_goals_are_made_from_them():
     env, params = small(starts=envs.Rough(0.03, 2.0))
     keys = jax.random.split(KEY, 8)

@@ -76,7 +76,7 @@ def test_random_walks_are_maps_of_one_piece():
     assert not any(min(np.ptp(np.argwhere(dig), axis=0)) == 0 for dig in np.asarray(turning.dig))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_walk_on_sand_ends_with_the_planners_and_digs():
     dig, _ = letters.letter_map("L")
     env, params = js.make("single-stroke", on=envs.OnSand(), goals=one_map(dig))

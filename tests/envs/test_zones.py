@@ -123,7 +123,7 @@ def test_goals_are_made_around_zones():
     assert np.abs(after.height - params.goals.goals[0]).max() < 2e-6
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_tool_passes_through_walls_unless_they_are_zones():
     walls = js.Walls(np.arange(16) == np.full((16, 1), 8))
     scene = replace(SMALL, walls=walls)

@@ -24,7 +24,7 @@ def test_the_goal_itself_is_right_and_strict_and_level_sand_is_not():
     assert right(E.start, E.start, DEPTH)  # nothing was asked for, and nothing was dug
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_one_stroke_less_or_another_one_is_wrong_and_a_small_shift_is_right_but_not_strict():
     assert not right(E.goal, left(E.strokes[:-1]), DEPTH)
     assert not right(E.goal, left([*E.strokes[:-1], [0.06, 0.06, 0.26, 0.26]]), DEPTH)

@@ -27,7 +27,7 @@ def alone(height, stroke, weight):
     return weighed(js.step(SAND, height, stroke, **QUICK).height, weight)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_losses_and_gradients_are_those_of_each_map_alone():
     value, slopes = js.value_and_grad_batch(SAND, weighed, MAPS, STROKES, WEIGHTS, chunk=2, **QUICK)
     one = jax.jit(jax.value_and_grad(alone, argnums=(0, 1)))
@@ -39,7 +39,7 @@ def test_losses_and_gradients_are_those_of_each_map_alone():
             assert np.allclose(found[k], slope, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_what_is_not_clean_has_no_loss_and_no_gradient():
     strokes = STROKES.copy()
     strokes[3, 1] = np.nan
@@ -50,7 +50,7 @@ def test_what_is_not_clean_has_no_loss_and_no_gradient():
         assert not np.delete(bad, 3, 0).any()
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_acting_leaves_the_sand_as_the_tool_did():
     found = act_batch(SAND, MAPS, STROKES, push=QUICK["push"]).height
     want = jax.vmap(lambda h, s: js.act(SAND, h, s, push=QUICK["push"]).height)(MAPS, STROKES)
@@ -66,7 +66,7 @@ def test_wheels_are_sorted_by_their_way_too():
         assert np.allclose(found[k], js.step(sand, np.zeros((24, 24)), strokes[k], **QUICK).height, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_large_maps_are_pushed_in_windows_and_again_where_these_are_too_small():
     """A window made for the blade alone does not hold the heap of a deep map of ridges; the results are the whole map's."""
     sand = js.make_scene((40, 40), 0.01, 0.5, tool=js.Blade())

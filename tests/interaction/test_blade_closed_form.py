@@ -33,7 +33,7 @@ def level(dtype="float64"):
     return np.zeros(SHAPE, dtype)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 def test_volume_is_kept(dtype):
     wild = np.random.default_rng(2).uniform(-0.05, SIDE + 0.05, (32, 4)).astype(dtype)
@@ -65,7 +65,7 @@ def test_mirrors_and_quarter_turns(dtype):
         assert np.allclose(js.step(scene(), turn(start), moved, push=FAST).height, turn(h), atol=atol), turn
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("edge", [js.Closed(), js.Draining(0.0)])
 def test_the_result_is_continuous_in_the_stroke(edge):
     run = jax.jit(jax.vmap(lambda s: js.act(scene(edge=edge), jnp.zeros(SHAPE), s, push=FAST).height))
@@ -77,7 +77,7 @@ def test_the_result_is_continuous_in_the_stroke(edge):
                 assert change.max() < 6 * step
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_angles_far_away_and_in_walls_do_not_matter():
     angles = np.full(SHAPE, 0.5)
     far = angles.copy()
@@ -134,7 +134,7 @@ def test_gradients():
     assert all(np.all(np.isfinite(v)) for v in gradient(at[0], at[1], at[2], jnp.asarray(-0.05), *at[4:]))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("tool", [js.Blade(depth=-0.02), js.NoTool()])
 def test_a_tool_above_the_sand_changes_nothing(dtype, tool):
     start = rough(dtype)
@@ -157,7 +157,7 @@ def test_what_is_not_finite_is_flagged():
         assert np.array_equal(out.height, level())
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_solid_cells_are_left_alone_and_sand_without_room_stays():
     solid = np.zeros(SHAPE, bool)
     solid[:, 22:] = solid[:14] = solid[18:] = True
@@ -173,7 +173,7 @@ def test_solid_cells_are_left_alone_and_sand_without_room_stays():
     assert h[14:18, 11:14].max() < 0
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sand_pushed_over_a_draining_edge_is_counted(dtype):
     sand = scene(edge=js.Draining(0.0))
     out = js.step(sand, level(dtype), (0.16, 0.16, 0.5, 0.16), push=FAST)
@@ -195,7 +195,7 @@ def test_vmap_equals_a_loop():
     assert np.allclose(js.step_batch(scene(), maps, strokes, push=FAST, chunk=2).height, loop, atol=4e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_it_comes_close_to_the_push_in_sub_steps():
     strokes, start = BATCH.astype(np.float32), np.zeros((32, *SHAPE), np.float32)
     full = js.step_batch(scene(), start, strokes, push=js.SteppedPush(0.25, 64)).height
@@ -241,7 +241,7 @@ def channel(push, way, rim=None, cells=60, walls=1):
     return np.asarray(out.height)[walls : walls + 8], float(out.drained), js.settle(sand, out.height).height[walls + 3]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_in_a_channel_all_that_is_cut_stands_ahead_as_a_triangle():
     """Before, 0.62, 0.44 and 0.27 of it did after 5, 10 and 20 cm."""
     for way in (0.05, 0.1, 0.15):
@@ -256,7 +256,7 @@ def test_in_a_channel_all_that_is_cut_stands_ahead_as_a_triangle():
         assert np.abs(h[:, ahead] - exact[ahead]).max() < 0.01 * MU * toe
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_over_an_edge_all_leaves_that_passes_it_or_stands_above_its_rim():
     """The heap of 96 cm^3 that a channel holds goes over the edge whole, and as far as its toe passes it."""
     end = 60 * 0.005
@@ -270,14 +270,14 @@ def test_over_an_edge_all_leaves_that_passes_it_or_stands_above_its_rim():
             assert drained == pytest.approx(max(heap - stays, 0) if rim < 1 else 0, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_nothing_drains_over_a_rim_above_the_sand():
     """Before, 4.2 cm^3 did."""
     sand = scene(edge=js.Draining(10.0))
     assert float(js.step(sand, level(), (0.16, 0.16, 0.16, 0.5), push=FAST).drained) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_half_a_blade_beside_a_closed_edge_is_half_of_one_twice_as_wide():
     """Before, the two lay 5% apart: the heap began farther ahead between two open ends than at one."""
     small = js.make_scene((16, 32), DX, ANGLE, tool=js.Blade(0.08, 0.015, 0.0075))

@@ -19,7 +19,7 @@ def square(n=40, neighbours=8, **parts):
     return js.make_scene((n, n), DX, ANGLE, neighbours, **parts)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     ("neighbours", "thickness", "degrees"),
     [(8, 1.0, 22.5), (8, 1.5, 0), (8, 2.0, 45), (4, 1.0, 45), ("isotropic", 1.5, 30)],
@@ -38,7 +38,7 @@ def test_a_blade_is_a_wall(neighbours, thickness, degrees):
     assert volume_error(np.zeros((40, 40)), h) < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("spacing", [0.01, 0.005, pytest.param(0.0025, marks=pytest.mark.slow)])
 def test_the_heap_of_a_blade_as_wide_as_its_bed_is_a_triangle(spacing):
     found = heap(spacing, js.SteppedPush())
@@ -106,7 +106,7 @@ LINES = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("tool", "apart", "neighbours", "heading"), LINES)
 def test_a_line_is_the_same_in_one_leg_and_in_many(tool, apart, neighbours, heading):
     """How sand flows is kept from leg to leg: without it, legs of a quarter of a cell left a map 2 to 27% off."""
@@ -130,7 +130,7 @@ def test_how_sand_flows_is_kept_from_one_frame_to_another(neighbours):
         assert np.abs(many - one).sum() < 1e-3 * np.abs(one).sum(), octant
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.compiled
 def test_isotropic_sand_moves_alike_in_float32():
     """A gradient that was just at repose once counted as far beyond it, where a compiler rounded its square differently in two
@@ -166,7 +166,7 @@ def test_nothing_drains_over_a_rim_above_the_sand():
     assert 0 < drained[0.0] < drained[-0.02]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("short", [0.05, -0.05])
 def test_what_drains_from_a_channel_is_its_arithmetic(short):
     """A blade that fills the channel stops `short` of the edge: what does not fit between, at repose from the edge, drains.
@@ -187,7 +187,7 @@ def test_what_drains_from_a_channel_is_its_arithmetic(short):
         assert float(out.drained) == pytest.approx(width * heap, rel=off)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 def test_large_maps_are_computed_where_sand_moves():
     level = np.zeros((160, 160), np.float32)

@@ -41,7 +41,7 @@ def frame(stroke):
     return (x - stroke[0]) * u[0] + (y - stroke[1]) * u[1], (y - stroke[1]) * u[0] - (x - stroke[0]) * u[1]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("degrees", [0, 30, 45, 90, 200])
 def test_a_trench_has_a_level_floor_berms_at_repose_and_a_heap_ahead(dtype, degrees):
     stroke = along(math.radians(degrees))
@@ -62,7 +62,7 @@ def test_a_trench_has_a_level_floor_berms_at_repose_and_a_heap_ahead(dtype, degr
     assert 0.9 * MU < float(js.steepest_slope(scene(), out.height)) <= MU + 1.1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_no_sand_inside_the_tool(dtype):
     for degrees in (0, 25, 60, 90, 135):
         stroke = along(math.radians(degrees)).astype(dtype)
@@ -74,7 +74,7 @@ def test_no_sand_inside_the_tool(dtype):
         assert inside.max() <= -BLADE.depth + (1e-8 if dtype == "float32" else 1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.long
 @pytest.mark.parametrize("n", [100, pytest.param(1000, marks=pytest.mark.slow)])
 def test_volume_after_many_random_pushes(n):
@@ -89,7 +89,7 @@ def test_volume_after_many_random_pushes(n):
     assert np.abs(np.asarray(out.height)).max() < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_rough_map_keeps_its_volume_and_rests(dtype):
     rough = np.random.default_rng(1).uniform(-0.01, 0.01, SHAPE).astype(dtype)
     out = js.step(scene(), rough, STROKE)
@@ -98,7 +98,6 @@ def test_rough_map_keeps_its_volume_and_rests(dtype):
     assert float(js.steepest_slope(scene(), out.height)) <= MU + 1.1e-3
 
 
-@pytest.mark.slow
 def test_sand_that_reaches_the_windows_edge_is_told_and_kept():
     """What flows in a window that moves must not be lost over its edge."""
     rng = np.random.default_rng(0)
@@ -125,7 +124,7 @@ def test_a_stroke_off_the_map_touches_nothing(dtype, stroke):
     assert np.array_equal(out.height, start)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("stroke", [(-0.1, 0.16, 0.3, 0.16), (0.2, 0.16, 0.9, 0.16), (0.24, -5.0, 0.24, 5.0)])
 def test_a_stroke_may_start_or_end_off_the_map(dtype, stroke):
     out = js.step(scene(), level(dtype), stroke)
@@ -135,7 +134,7 @@ def test_a_stroke_may_start_or_end_off_the_map(dtype, stroke):
     assert h.min() < -0.9 * BLADE.depth
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_how_far_off_the_map_a_stroke_starts_does_not_matter():
     near = js.step(scene(), level(), (-0.1, 0.16, 0.3, 0.16)).height
     far = js.step(scene(), level(), (-3.1, 0.16, 0.3, 0.16)).height
@@ -152,7 +151,7 @@ def test_a_stroke_of_no_length_lowers_and_lifts_the_tool(dtype):
     assert volume_error(level(), h) <= 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("tool", [js.Blade(0.06, 0.015, -0.02), js.NoTool()])
 def test_a_tool_above_the_sand_changes_nothing(dtype, tool):
     start = js.settle(scene(), np.random.default_rng(2).uniform(-0.01, 0.01, SHAPE).astype(dtype)).height
@@ -175,7 +174,7 @@ def test_passes_clean_and_deeper_ones_deepen(dtype):
     assert np.asarray(twice.height)[32, 40] == pytest.approx(-0.0075, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 def test_mirrors_and_quarter_turns(dtype):
     tolerance = 2e-6 if dtype == "float32" else 1e-12
@@ -189,7 +188,7 @@ def test_mirrors_and_quarter_turns(dtype):
         assert np.allclose(js.step(sand, turn(start), moved).height, turn(h), atol=tolerance), turn
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sand_and_blade_may_be_raised_together():
     a = js.step(scene(), level(), STROKE).height
     b = js.step(scene(js.Blade(0.06, 0.015, 0.0075 - 0.5)), level() + 0.5, STROKE).height
@@ -220,7 +219,7 @@ def test_a_stroke_that_is_not_finite_is_flagged():
     assert np.array_equal(out.height, level())
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_tool_that_is_not_finite_is_flagged():
     push = jax.jit(lambda blade: js.step(js.make_scene(SHAPE, DX, ANGLE, tool=js.Blade(*blade)), level(), STROKE))
     for bad in range(3):
@@ -229,7 +228,7 @@ def test_a_tool_that_is_not_finite_is_flagged():
         assert np.array_equal(out.height, level())
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_strokes_from_far_reach_the_map_or_are_flagged():
     for far in (1e3, 1e6):
         out = js.step(scene(), level("float32"), (0.2, 0.16, far, 0.16))
@@ -239,7 +238,7 @@ def test_strokes_from_far_reach_the_map_or_are_flagged():
     assert int(out.outcome) == js.Outcome.NOT_FINITE
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sand_before_a_wall_stays_in_its_column_until_the_blade_is_lifted():
     """The one place where sand is inside the tool; see `step`."""
     stroke = (0.3, 0.16, SHAPE[1] * DX, 0.16)
@@ -252,7 +251,7 @@ def test_sand_before_a_wall_stays_in_its_column_until_the_blade_is_lifted():
     assert volume_error(level(), out.height) < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_solid_cells_are_left_alone():
     solid = np.zeros(SHAPE, bool)
     solid[:, 70:73] = True
@@ -266,7 +265,7 @@ def test_solid_cells_are_left_alone():
     assert volume_error(start, h) <= 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sand_pushed_over_a_draining_edge_is_counted(dtype):
     out = js.step(scene(edge=js.Draining(0.0)), level(dtype), (0.2, 0.16, 0.9, 0.16))
     js.check(out)
@@ -275,7 +274,7 @@ def test_sand_pushed_over_a_draining_edge_is_counted(dtype):
     assert float(out.drained) == pytest.approx(lost, rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("push", [js.SteppedPush(), js.SwathPush()])
 def test_a_blade_that_skims_level_sand_at_0_leaves_it_to_drain(push):
     """Nothing but the rim, far below, tells the push how large heights are."""

@@ -24,7 +24,7 @@ def held(scene, load):
     return float(js.load_volume(scene, load))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     ("heights", "mean"), [((-0.01, -0.01), 0.01), ((0.0, -0.01), 0.005), ((-0.01, 0.0), 0.005), ((0.005, -0.01), 1 / 300)]
 )
@@ -36,7 +36,7 @@ def test_a_scoop_holds_its_width_times_its_way_times_its_depth(heights, mean):
     assert np.asarray(out.height).max() < 1e-3  # nothing is pushed ahead while there is room
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("last", [0.5, 0.1, 0.0])
 def test_short_legs_at_the_ends_change_little(last):
     """The edge is a cell thick, however short a leg is; it cuts up to half a cell beyond a shorter one."""
@@ -140,7 +140,7 @@ def test_more_than_there_is_and_off_the_map_are_outcomes():
     assert held(SAND, lost.load) == pytest.approx(1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_loads_and_numbers_that_make_no_sense_are_told_of_and_change_nothing():
     path = np.array([[0.06, 0.12, 0.0], [0.16, 0.12, -0.01]])
     one, nothing = jnp.asarray(1.0), jnp.zeros(())
@@ -182,7 +182,7 @@ def test_a_float64_load_is_not_rounded_by_float32_heights():
     assert float(left.high) + float(left.low) == pytest.approx(0.123456789012, rel=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_vmap_over_the_capacity():
     def high(capacity):
         scene = js.make_scene((N, N), DX, ANGLE, tool=js.Bucket(0.06, 0.04, capacity))
@@ -191,7 +191,7 @@ def test_vmap_over_the_capacity():
     assert jax.vmap(high)(np.array([1e-6, 2e-5, 1e30])) * DX**2 == pytest.approx([1e-6, 2e-5, 6e-5], rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_vmap_equals_a_loop():
     paths = np.array([[[0.06, 0.12, 0.0], [0.16, 0.1, -0.01]], [[0.2, 0.03, -0.01], [0.05, 0.18, -0.002]]])
     maps = jax.vmap(lambda h, p: js.scoop(SAND, h, p))(np.stack([ROUGH, LEVEL]), paths)
@@ -220,7 +220,7 @@ def test_derivatives_of_a_scoop():
         assert slope[place] == pytest.approx(difference, rel=1e-4, abs=1e-4 * np.abs(slope).max())
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_derivatives_of_pouring():
     weights = np.random.default_rng(4).standard_normal((N, N))
     load = js.Load(jnp.asarray(1.0), jnp.zeros(()))

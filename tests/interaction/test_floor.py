@@ -23,7 +23,7 @@ def rough(seed, span):
     return span * (walk - walk.min()) / np.ptp(walk)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_tray_is_emptied_to_its_floor():
     tray = on(-0.02, js.Bucket(width=0.28, length=0.03, capacity=1.0, depth=0.05))
     out = js.scoop(tray, LEVEL, [[0.04, 0.1], [0.16, 0.1]])
@@ -32,7 +32,7 @@ def test_a_tray_is_emptied_to_its_floor():
     assert float(js.load_volume(tray, out.load)) == pytest.approx(0.12 * N * DX * 0.02, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("neighbours", [8, "isotropic"])
 def test_a_blade_clears_a_layer_off_its_floor(neighbours):
     """What a blade as wide as the bed clears, V a unit of width, stands ahead as a triangle upon the layer there."""
@@ -72,7 +72,7 @@ def test_no_tool_cuts_the_floor(tool):
     assert np.array_equal(bare.height, rock)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_floor_deeper_than_the_tool_changes_nothing():
     far, deep = (js.make_scene((N, N), DX, ANGLE, base=base, tool=js.Blade()) for base in (js.Base(-0.2), None))
     stroke = [0.05, 0.08, 0.13, 0.11]
@@ -100,7 +100,7 @@ def random_action(scene, rng, height, load):
 FEW, MANY = 24, 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     ("dtype", "count", "most"),
     [
@@ -140,7 +140,7 @@ def test_what_is_removed_is_no_more_than_there_is():
     assert np.asarray(more.height).min() >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_batch_is_its_strokes():
     rock = rough(4, 0.06) - 0.06
     scene = on(rock, js.Blade(0.06, 0.015, 0.03))
@@ -179,7 +179,7 @@ def test_closed_forms_refuse_floors(push, tool):
         js.step(on(-0.1, tool), LEVEL, [0.05, 0.05, 0.1, 0.1], push=push)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("neighbours", ["isotropic", pytest.param(8, marks=pytest.mark.slow)])
 def test_what_drains_off_a_floor_is_what_the_map_loses(neighbours):
     tray = on(-0.01, js.Blade(0.05, 0.015, 0.03), neighbours, edge=js.Draining(-0.02))
@@ -190,7 +190,7 @@ def test_what_drains_off_a_floor_is_what_the_map_loses(neighbours):
     assert float(out.drained) > 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_blade_feels_no_floor():
     """Forces are those of the sand that is cut: none on bare floor, and no more than lies upon it."""
     soil, path = js.forces.WONG_DRY_SAND, [[0.05, 0.1], [0.1, 0.1]]

@@ -19,7 +19,7 @@ LEVEL = np.zeros(SHAPE)
 START, CORNER, END = (0.1, 0.1), (0.25, 0.1), (0.25, 0.22)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_two_points_are_a_stroke():
     assert np.array_equal(js.follow(SAND, LEVEL, [START, CORNER]).height, js.step(SAND, LEVEL, (*START, *CORNER)).height)
 
@@ -34,7 +34,7 @@ def test_a_point_on_the_way_changes_little_and_the_heap_goes_along():
     assert np.abs(lifted.height - whole.height).max() > 0.1 * np.abs(whole.height).max()
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_legs_of_no_length_do_nothing():
     path = js.follow(SAND, LEVEL, [START, CORNER, END])
     padded = js.follow(SAND, LEVEL, [START, CORNER, CORNER, END, END, END])
@@ -77,7 +77,7 @@ def test_a_turn_is_the_same_to_the_left_and_to_the_right():
     assert np.allclose(left, np.flipud(right), atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_frames_are_the_maps_after_each_leg():
     path = np.array([START, CORNER, END])
     out, frames = js.follow_frames(SAND, LEVEL, path)
@@ -90,7 +90,7 @@ def test_frames_are_the_maps_after_each_leg():
     assert np.array_equal(bare.height, LEVEL)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_paths_may_be_batched():
     paths = np.array([[START, CORNER, END], [START, END, CORNER]])
     many = jax.vmap(lambda p: js.follow(SAND, LEVEL, p).height)(paths)

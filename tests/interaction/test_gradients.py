@@ -33,7 +33,7 @@ def point(seed):
     return (rng.uniform(0.03, 0.17, 4), 0.023, 0.0152, 0.0077, 0.5, height)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_push_and_its_settling(seed):
@@ -52,14 +52,14 @@ def test_a_push_and_its_settling(seed):
         assert float(forward(x, tangents)[1]) == pytest.approx(slope, rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_where_nothing_changes_there_is_no_gradient():
     x = tuple(jnp.asarray(v, float) for v in point(0))
     assert np.array_equal(gradient(jnp.array([5.0, 5.0, 6.0, 6.0]), *x[1:])[0], np.zeros(4))
     assert np.all(np.isfinite(gradient(jnp.array([0.1013, 0.0972] * 2), *x[1:])[0]))  # no length: finite all the same
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_gradient_of_settling_is_that_of_its_sweeps():
     h = np.random.default_rng(0).uniform(-0.02, 0.02, SHAPE)
     scene = js.make_scene(SHAPE, 0.01, ANGLE)

@@ -22,7 +22,7 @@ DIVING = np.array([[0.05, 0.06, 0.02], [0.12, 0.09, -0.012], [0.19, 0.17, 0.004]
 WHEEL = js.Wheel(radius=0.04, width=0.03, sinkage=0.012, slip_angle=0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("tool", [BLADE, WHEEL])
 def test_a_path_at_one_height_is_the_level_path(tool):
     sand = js.make_scene((N, N), DX, ANGLE, tool=tool)
@@ -44,7 +44,7 @@ def test_sand_is_kept_and_the_outcome_is_clean():
     assert float(out.residual) <= 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_mirrors_and_quarter_turns():
     start, stop = DIVING[0], DIVING[1]
     height = np.asarray(js.step(SAND, ROUGH, [*start, *stop]).height)
@@ -82,7 +82,7 @@ def test_what_is_cut_stands_ahead_as_a_triangle(heights, cut):
     assert h[ahead].max() == pytest.approx(math.sqrt(2 * math.tan(math.radians(31)) * volume), rel=0.06)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_wheel_that_rises_leaves_a_rut_that_rises():
     sand = js.make_scene((N, N), 0.005, ANGLE, tool=js.Wheel(radius=0.03, width=0.05, sinkage=0.012))
     h = np.asarray(js.act(sand, np.zeros((N, N)), [0.02, 0.06, -0.008, 0.1, 0.06, -0.001]).height)
@@ -93,7 +93,7 @@ def test_a_wheel_that_rises_leaves_a_rut_that_rises():
     assert volume_error(np.zeros((N, N)), h) < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_batch_is_its_strokes():
     strokes = np.array([[*DIVING[0], *DIVING[1]], [*DIVING[2], *DIVING[1]]])
     batch = js.step_batch(SAND, np.stack([ROUGH, ROUGH]), strokes)

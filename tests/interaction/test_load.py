@@ -43,7 +43,7 @@ def test_a_little_lies_as_a_number_would():
     assert many.load.surface == pytest.approx(float(one.load.high) / 30)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_what_is_dumped_is_taken_from_all_of_it():
     full = js.scoop(sand(), LEVEL, DEEP_CUT).load
     out = js.dump(sand(), LEVEL, [[0.2, 0.12]], full, amount=0.25 * js.load_volume(sand(), full))
@@ -54,7 +54,7 @@ def test_what_is_dumped_is_taken_from_all_of_it():
     assert float(js.volume(sand(), rest.height)) == pytest.approx(float(js.load_volume(sand(), full)), rel=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_batch_is_its_scoops():
     cuts = jnp.stack([DEEP_CUT, DEEP_CUT * np.array([1, 1, 0.5])])
     batch = jax.vmap(lambda path: js.scoop(sand(), LEVEL, path))(cuts)

@@ -20,7 +20,7 @@ def sand(plates, shape=LEVEL.shape, neighbours=8, **options):
     return js.make_scene(shape, DX, ANGLE, neighbours, tool=tool, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("neighbours", [8, "isotropic"])
 @pytest.mark.parametrize("aside", [0.0, 0.004])
 def test_what_it_cuts_stays_between_the_plates(neighbours, aside):
@@ -48,7 +48,7 @@ def test_mirrors_and_quarter_turns():
         assert np.abs(js.step(scene, turn(rough), other).height - turn(out)).max() < 2e-6
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_window_around_it_is_the_whole():
     near, far = (js.step(sand(0.05, (96, 96), window=w), np.zeros((96, 96)), STROKE + 0.3) for w in (None, js.Whole()))
     assert np.abs(near.height - far.height).max() < 1e-4

@@ -69,7 +69,7 @@ def test_volume_is_kept(dtype, push):
                 assert np.abs(h).max() < 0.06
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @both
 def test_volume_is_kept_pass_after_pass(push):
     h = start = rough("float32")
@@ -78,7 +78,7 @@ def test_volume_is_kept_pass_after_pass(push):
     assert volume_error(start, h) <= 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @both
 def test_the_sand_rests_and_lies_no_deeper_than_the_wheel_went(dtype, push):
     for slip in (0, 0.5, 1.2):
@@ -116,7 +116,7 @@ def test_in_one_go_more_sand_goes_to_the_side_that_leads():
     assert left > 1.5 * right
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @both
 def test_a_wheel_above_the_sand_moves_nothing(dtype, push):
     for start in (level(dtype) - 0.0151, rough(dtype) - 0.036):
@@ -132,14 +132,14 @@ def test_a_stroke_off_the_map_touches_nothing(push, stroke):
     assert np.array_equal(rolled(push, start, stroke), start)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @both
 def test_how_far_off_the_map_a_stroke_starts_does_not_matter(push):
     near, far = (rolled(push, stroke=(x, 0.2, 0.25, 0.2)) for x in (-0.2, -3.2))
     assert np.allclose(near, far, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @both
 def test_a_second_pass_on_the_same_line_moves_little(push):
     """But for what had slid back; each pass moves less than the one before."""
@@ -166,7 +166,7 @@ def test_what_is_not_finite_is_flagged(push):
         assert np.array_equal(out.height, level())
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @both
 def test_extreme_wheels_and_strokes_are_sound(push):
     wheels = (
@@ -192,7 +192,7 @@ def test_extreme_wheels_and_strokes_are_sound(push):
         assert volume_error(level(), h) <= 1e-14
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @both
 def test_a_map_of_one_cell(push):
     sand = js.make_scene((1, 1), 0.1, ANGLE, tool=js.Wheel(0.1, 0.1, 0.05, 0.5))
@@ -220,7 +220,7 @@ def lost(start, out):
     return math.fsum([*start.astype(float).ravel(), *-np.asarray(out.height, float).ravel()]) * DX**2
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sand_over_a_draining_edge_is_counted(fenced):
     for slip in (0, 0.5, -1.2):
         out = fenced(np.array([[0.2, 0.02]] + [[0.5, 0.02]] * 3), level("float32"), slip)
@@ -260,7 +260,7 @@ def shallower(trenches):
     return np.all(np.diff(moved) < 0) and np.all(np.diff([-h.min() for h in trenches]) <= 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_grousers_fill_the_trench():
     run = quick(lambda sand, h, stroke: js.step(sand, h, stroke).height)
 
@@ -301,7 +301,7 @@ def distances(spacing, spin=0.0):
     return np.abs([h - exact(across) for h, exact in zip(left_to_right, relaxed(runs, 5e-4), strict=True)])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.long
 def test_the_push_in_one_go_is_the_exact_relaxation_to_the_spacing():
     spacings = (0.01, 0.005, 0.0025)
@@ -320,7 +320,7 @@ def test_grousers_fill_the_trench_in_one_go():
     assert np.array_equal(maps[-1], np.zeros(LONG[0]))  # of two piles alike nothing remains
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 @heavy
 def test_vmap_and_batches_equal_a_loop(push):
@@ -345,7 +345,7 @@ def test_other_wheels_and_strokes_need_no_other_program(push):
     assert simulate._follow._cache_size() == before
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 def test_a_window_that_follows_the_wheel():
     window = js.Window((36, 24), 1e-3)
@@ -355,7 +355,7 @@ def test_a_window_that_follows_the_wheel():
     assert np.abs(rolled(STEPPED, stroke=stroke, sand=scene(0.5, 0.01)) - part.height).max() < 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_push_in_sub_steps_comes_close_to_the_push_in_one_go():
     """As far as sand flows around the ends of a wheel, which sections that exchange nothing do not know."""
     for slip in (0.0, 0.8, math.pi / 2):

@@ -84,7 +84,7 @@ def left(v):
 left_and_slopes = quick(lambda some: jax.lax.map(jax.value_and_grad(left), some))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("slip", "which"), [(0.0, 3), (0.7, 3), (0.7, 0), (0.7, 4)])
 def test_derivatives_in_one_go_add_up_to_the_change(slip, which):
     """Over a cell's width, in steps larger than a sample: edges of the cut count."""
@@ -96,7 +96,7 @@ def test_derivatives_in_one_go_add_up_to_the_change(slip, which):
     assert abs(summed - (values[-1] - values[0])) < 0.03 * np.ptp(values)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("field", [{"sinkage": -0.01}, {"sinkage": 0.06}, {"slip_angle": 1.7}])
 @both
 def test_a_traced_wheel_that_is_none_is_flagged(push, field):

@@ -36,7 +36,7 @@ def heap(spacing, rows=3, neighbours=8, way=0.16, sinkage=0.012):
     return h.max() / peak, np.abs(h - exact)[:, ahead].mean(0).sum() * spacing / volume
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     ("spacing", "neighbours"),
     [
@@ -54,7 +54,7 @@ def test_the_heap_of_a_wheel_as_wide_as_its_bed_is_a_triangle(spacing, neighbour
     assert error < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("width", "degrees"), [(1.0, 20), (1.5, 0), (1.0, 30)])
 def test_a_wheel_dragged_broadside_is_a_wall(width, degrees):
     """Of a chord wider than the bed, it leaves behind it what its rim shaped: nothing got through."""
@@ -87,7 +87,7 @@ def test_shorter_sub_steps_change_ever_less():
         assert apart[1] < 0.03 * np.abs(maps[-1]).sum()
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
     sand = js.make_scene((32, 32), DX, ANGLE, tool=js.Wheel(width=0.03, sinkage=0.012))
     maps = [np.asarray(js.follow(sand, np.zeros((32, 32)), padded(half_turn(parts), 6)).height) for parts in (1, 2, 4)]
@@ -97,7 +97,7 @@ def test_a_turn_sweeps_and_does_not_depend_on_its_parts():
     assert maps[0][np.hypot(x, y) < 2].mean() < -0.7 * 0.012  # it dug where it swept
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_nothing_drains_over_a_rim_above_the_sand():
     stroke, level, drained = [0.16, 0.16, 0.16, 0.5], np.zeros((32, 32)), {}
     for rim in (10.0, 0.0, -0.02):

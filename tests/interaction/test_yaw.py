@@ -24,7 +24,7 @@ def sand(yaw, width=0.06, shape=SHAPE):
     return js.make_scene(shape, DX, ANGLE, tool=js.Blade(width, 0.015, 0.008, yaw))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_square_is_square():
     found, square = (js.step(sand(yaw), ROUGH, STROKE).height for yaw in (0.0, None))
     assert np.abs(found - square).max() < 1e-12
@@ -49,7 +49,7 @@ def test_the_windrow_lies_on_the_side_to_which_the_face_looks():
     assert (np.diff(ahead) < 0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_mirrored_sand_is_pushed_by_the_mirrored_blade():
     x0, y0, x1, y1 = STROKE
     found = np.asarray(js.step(sand(0.6), ROUGH, STROKE).height)
@@ -87,7 +87,7 @@ def test_derivatives_by_the_angle():
         assert float(by_stroke[k]) == pytest.approx(difference, rel=1e-4, abs=1e-4 * float(np.abs(by_stroke).max()))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_an_angle_out_of_range_is_named():
     with pytest.raises(ValueError, match=r"tool\.yaw: got 1\.5 rad; give -pi/3 to pi/3: for degrees use math\.radians"):
         sand(1.5)

@@ -42,7 +42,7 @@ def test_many_goals_at_once_are_what_each_is_alone():
     np.testing.assert_allclose(both[1, 0], one[1, 0], atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_looking_ahead_finds_the_order_and_leaves_out_what_misleads():
     wrong = np.array([[0.05, 0.05, 0.25, 0.06]])
     found = look_ahead(Always(np.concatenate([wrong, F.strokes[::-1]])), SAND, 3, width=4)
@@ -54,7 +54,7 @@ def test_looking_ahead_finds_the_order_and_leaves_out_what_misleads():
     assert found.calls <= most_calls(3, 4) == 3 * 4**2 + 2 * 3 * (8 * 3 + 2) + 3
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_what_is_a_little_off_is_put_right():
     crooked = F.strokes + np.array([0.001, -0.0015, -0.0005, 0.001])
     found = look_ahead(Always(crooked), SAND, 3, width=3)
@@ -107,7 +107,7 @@ def test_where_a_loss_only_falls_ends_go_the_whole_way_but_not_off_the_map():
     assert edge[0, 2] == pytest.approx(0.295)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_nothing_is_done_where_nothing_helps():
     done = sand_loss(F.scene, F.goal, F.goal)
     found = look_ahead(Always(F.strokes), done, 3, width=2)

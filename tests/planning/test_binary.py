@@ -102,7 +102,7 @@ def test_published_step_counts(letter, steps):
     assert (found.steps, found.optimal, found.lower_bound, found.gap) == (steps, True, steps, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("letter", "alpha"), complexity.PUBLISHED)
 def test_the_papers_search_opens_as_many_nodes_as_published(letter, alpha):
     nodes, steps = complexity.PUBLISHED[letter, alpha]
@@ -131,7 +131,7 @@ def test_every_letter_is_dug_by_a_proven_plan(letter):
     assert set(replay(free.start, free.path)) == set(cells)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_brute_force_agrees():
     rng = np.random.default_rng(0)
     for k in range(1000):
@@ -148,7 +148,7 @@ def test_brute_force_agrees():
             assert end in (None, found.cells[-1])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_an_integer_programme_agrees():
     rng = np.random.default_rng(1)
     for _ in range(12):
@@ -243,7 +243,7 @@ def test_anytime_stops_and_says_how_far_it_may_be_off():
     assert found.optimal == (found.lower_bound == found.steps)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_out_of_budget_it_gives_a_walk_and_an_honest_bound():
     dig, start = complexity.grown(14, 90, 0.3, 1)
     best = js.plan(dig, start)
@@ -274,7 +274,7 @@ def test_blocks_share_no_edge_and_meet_in_cut_cells():
     assert sum(len(b.cells) - 1 for b in blocks) == len(board.cells) - 1  # a tree of blocks
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_truncated_sweeps_and_bounds_by_degrees_prove_nothing_false(monkeypatch):
     rng = np.random.default_rng(4)
     for k in range(300):
@@ -298,7 +298,7 @@ def test_truncated_sweeps_and_bounds_by_degrees_prove_nothing_false(monkeypatch)
         assert all(b in problem.board.near[a] for a, b in pairwise(walk))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_wide_blocks_are_bounded_by_degrees_honestly():
     for seed in range(3):
         dig = np.ones((11, 12), bool)
@@ -316,7 +316,7 @@ def test_wide_blocks_are_bounded_by_degrees_honestly():
                     assert tour.lower_bound <= tour.cost
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_long_ways_do_not_overflow():
     length = 17_000
     dig = np.zeros((2, 2 * length + 2), bool)
@@ -328,7 +328,7 @@ def test_long_ways_do_not_overflow():
     assert found.steps == 2 * length + 3
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_seconds_hold_on_large_maps():
     for dig, options in (
         (np.ones((150, 150), bool), {}),
@@ -342,7 +342,7 @@ def test_seconds_hold_on_large_maps():
         assert found.lower_bound <= found.cost
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_whole_layers_are_an_engine_too():
     dig, start = letter_map("P")
     found = js.plan(dig, start, engine="frontier")

@@ -81,7 +81,7 @@ def test_every_letter_over_its_goal_cells(letter):
     assert found.steps == js.plan(dig, start).steps
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_brute_force_agrees():
     rng = np.random.default_rng(0)
     for _ in range(110):

@@ -38,7 +38,7 @@ def account(goal, budget):
     return Account(sand_loss(goal.scene, goal.start, goal.goal), budget)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_print_is_its_stroke_wherever_it_is_moved(bar):
     counted = account(bar, 100)
     mark = print_of(counted)
@@ -55,7 +55,7 @@ def test_a_print_is_its_stroke_wherever_it_is_moved(bar):
     assert np.allclose(longer[:, 20:], np.roll(pushed, (3, 0), (0, 1))[:, 20:], atol=2e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_sketch_of_one_stroke_is_within_a_quarter_of_a_cell(bar):
     mark = print_of(account(bar, 1))
     plans, left = guesses(mark, bar.start, bar.goal, 1, np.random.default_rng(0))
@@ -64,7 +64,7 @@ def test_the_sketch_of_one_stroke_is_within_a_quarter_of_a_cell(bar):
     assert np.all(np.diff(left) >= 0)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_where_strokes_cross_prints_one_after_the_other_come_closer_than_their_sum():
     ends = []
     for crossed in many_strokes(goals=3):
@@ -101,7 +101,7 @@ def test_a_plan_in_the_wrong_order_and_direction_is_put_right(tee):
     assert np.allclose(found.strokes[0], tee.strokes) or found.losses[0] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_stroke_is_found_within_the_budget_and_again_by_the_same_key(short):
     found, again = (
         js.optimise_strokes(short.scene, short.goal, strokes=1, key=k, budget=100) for k in (3, jax.random.key(3))
@@ -130,7 +130,7 @@ def test_a_letter_is_found_within_the_budget_and_again_by_the_same_key(tee):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("name", ["short", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bar", "tee"))])
 def test_the_number_of_strokes_is_found(name, request):
     goal = request.getfixturevalue(name)
@@ -138,7 +138,7 @@ def test_the_number_of_strokes_is_found(name, request):
     assert as_many_as_pay(counted, print_of(counted), 5, np.random.default_rng(0)) == len(goal.strokes)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("strokes", [1, pytest.param(None, marks=pytest.mark.slow)])
 def test_strokes_that_would_make_it_worse_are_not_given(short, strokes):
     bump = np.zeros((16, 16), np.float32)
@@ -151,7 +151,7 @@ def test_strokes_that_would_make_it_worse_are_not_given(short, strokes):
     assert 0 < found.spent <= 40
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_smoothing_can_be_left_out_and_changed(short):
     def blurs(smoothing):
         counted, seen = account(short, 400), []

@@ -21,7 +21,7 @@ def shape(target, before=None):
     return pipeline.shape(target, None if before is None else np.asarray(before))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("letter", ["A", *(pytest.param(letter, marks=pytest.mark.slow) for letter in "SQ")])
 def test_a_letter_map_is_trenched(letter):
     dig, start = letters.letter_map(letter)
@@ -39,7 +39,7 @@ def test_a_letter_map_is_trenched(letter):
 LETTERS = [pytest.param(a, marks=() if a in "IT" else pytest.mark.slow) for a in string.ascii_uppercase]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("letter", LETTERS)
 def test_every_letter_runs(letter):
     dig, start = letters.letter_map(letter)
@@ -77,7 +77,7 @@ def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
     assert result.figures["iou"] > 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_rough_surface_is_settled_first():
     dig, start = letters.letter_map("L")
     target = pipeline.map_target(dig, start, "L", pipeline.Layout())
@@ -89,7 +89,7 @@ def test_a_rough_surface_is_settled_first():
         shape(target, np.zeros((3, 3)))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_terrain_as_a_goal():
     layout = pipeline.Layout(depth=0.0075)
     result = shape(pipeline.height_target(surfaces.terrain_surface((48, 48), 0.03), "terrain", "terrain", layout))

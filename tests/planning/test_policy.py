@@ -43,7 +43,7 @@ def params():
     return jax.tree.map(lambda p: p + 0.1 * np.sin(np.arange(p.size, dtype=p.dtype)).reshape(p.shape), variables)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_starts_and_ends_are_shares_of_one(params):
     scores = look(params, maps(0), maps(1))
     np.testing.assert_allclose(jnp.exp(scores.start).sum((1, 2)), 1, rtol=1e-5)

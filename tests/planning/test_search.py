@@ -56,7 +56,7 @@ def test_a_plan_gains_and_its_bounds_hold(found):
     assert 0.9 * BUDGET < found.effort.cost <= BUDGET
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_equal_seeds_give_equal_plans(found):
     again = js.plan_sand(SCENE, LEVEL, GOAL, strokes=2, budget=BUDGET)
     np.testing.assert_array_equal(again.strokes, found.strokes)
@@ -109,7 +109,7 @@ def test_at_the_goal_there_is_nothing_to_do():
     assert done.reason.startswith("the sand lies as the goal has it already")
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_where_no_stroke_is_found_the_plan_says_why():
     trench = LEVEL.copy()
     trench[7, 3:11] = -0.0005  # far shallower than the blade digs
@@ -127,7 +127,7 @@ def test_where_no_stroke_is_found_the_plan_says_why():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_steps_find_a_path_again():
     steps = js.Steps(cell=2)
     at = corners(SCENE, steps)
@@ -139,7 +139,7 @@ def test_steps_find_a_path_again():
     np.testing.assert_allclose(runs.sum(1), steps.cell * 0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("neighbours", [4, 8])
 @pytest.mark.parametrize("surface", ["level", "rough"])
 def test_no_stroke_lowers_more_than_the_proven_amount(surface, neighbours):
@@ -185,7 +185,7 @@ def test_nodes_that_look_alike_are_one():
     assert distinct(names, parent, np.array([3, 1, 2, 0]), 2, 4) == [3, 1]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_children_are_pushed_as_they_would_be_alone():
     ways = np.concatenate([STROKES, STROKES[:, [2, 3, 0, 1]], STROKES / 2])
     maps = pushed(SCENE, np.repeat(GOAL[None], len(ways), axis=0), ways)
@@ -210,7 +210,7 @@ def test_strokes_stay_on_the_map_and_within_their_length():
         assert np.all(np.abs(strokes - 0.07) <= 0.065 + 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_binary_plan_and_the_rivals():
     drawn = LEVEL.copy()
     drawn[4:6, 2:10], drawn[6:10, 8:10] = -0.0075, -0.0075

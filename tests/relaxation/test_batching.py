@@ -32,7 +32,7 @@ def same(a, b):
         assert np.all((np.abs(x - y) <= rounding) | (np.isnan(x) & np.isnan(y))), name
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     ("scheme", "edge"),
     [
@@ -56,7 +56,7 @@ CUTS = [(None, 37), (1, 2), (1, 7), (5, 1), (5, 37), (64, 7)]
 OTHERS = [(chunk, many) for chunk in (None, 1, 5, 64) for many in (1, 2, 7, 37) if (chunk, many) not in CUTS]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("chunk", "many"), [*CUTS, *(pytest.param(*cut, marks=pytest.mark.slow) for cut in OTHERS)])
 def test_however_it_is_cut_up(many, chunk, monkeypatch):
     scene, h = js.make_scene(SHAPE, DX, ANGLE), maps("float32")[:many]
@@ -67,7 +67,7 @@ def test_however_it_is_cut_up(many, chunk, monkeypatch):
         same(js.settle_batch(scene, h, chunk=chunk), whole)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_bound_holds_for_maps_that_were_set_aside():
     scene, h = js.make_scene(SHAPE, DX, ANGLE), maps("float32")
     stop = js.UntilStill(bound=40)
@@ -77,7 +77,7 @@ def test_the_bound_holds_for_maps_that_were_set_aside():
     assert int(out.sweeps.max()) == 40
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_pushes_on_every_core(monkeypatch):
     scene = js.make_scene(SHAPE, DX, ANGLE, tool=js.Blade())
     strokes = np.random.default_rng(1).uniform(0.02, 0.1, (5, 4)).astype("float32")
@@ -90,7 +90,7 @@ def test_pushes_on_every_core(monkeypatch):
     assert np.array_equal(one[0].height, two[0].height)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_threads_compute_in_the_callers_precision(monkeypatch):
     monkeypatch.setattr(batch, "cores", lambda: 2)
     scene = js.make_scene(SHAPE, DX, ANGLE)

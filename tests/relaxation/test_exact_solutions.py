@@ -110,7 +110,7 @@ def test_point_source_its_wall_and_its_corner():
     assert corner[0, 0] / exact == pytest.approx(1.036, abs=0.06)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("rows", "columns"), [(24, 24), (16, 32)])
 def test_overfilled_draining_table(rows, columns):
     """Open edges: h = mu times the distance to the edge; V = mu W^2 (3 L - W) / 12. Second order in the volume."""

@@ -50,7 +50,7 @@ def test_laws(neighbours, scheme, dtype):
     assert np.array_equal(again.height, after)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("neighbours", [4, 8, "isotropic"])
 def test_bare_rock_is_still_however_steep(neighbours):
     cliffs = 0.3 * np.random.default_rng(2).random((N, N))
@@ -70,7 +70,7 @@ def test_a_dry_patch_stays_dry(neighbours):
     assert out.max() == 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("cells", "most"), [(40, 0.045), (80, 0.025)])
 def test_a_wedge_at_the_foot_of_a_slope(cells, most):
     """Rock of slope S, steeper than repose: sand V on it, a unit of width, slides to its foot.
@@ -89,7 +89,7 @@ def test_a_wedge_at_the_foot_of_a_slope(cells, most):
     assert np.abs(np.asarray(out.height)[0] - exact).sum() < most * sand.sum()
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("neighbours", [4, 8, "isotropic"])
 def test_a_floor_that_is_far_away_changes_nothing(neighbours):
     heap = HEAP + rough(3, 0.01)
@@ -109,7 +109,7 @@ def test_a_floor_drains():
     assert np.asarray(out.height - roof).max() < 1e-4 * DX
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_batch_and_a_window_are_the_whole():
     scene = on(ROCK)
     maps = np.stack([ROCK + HEAP, ROCK + 2 * HEAP, ROCK])

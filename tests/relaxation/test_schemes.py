@@ -74,7 +74,7 @@ def test_symmetries_hold(neighbours):
             assert np.abs(settled(turn(h)) - turn(s)).max() <= (0 if exact else 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("neighbours", NEIGHBOURS)
 def test_super_time_stepping_is_faithful_and_needs_few_sweeps(neighbours):
     h = column(32 if neighbours == "isotropic" else 48)
@@ -86,7 +86,7 @@ def test_super_time_stepping_is_faithful_and_needs_few_sweeps(neighbours):
     assert int(fast.sweeps) < int(slow.sweeps) / 5
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_super_time_stepping_is_first_order_in_growth():
     h = column(32)
     scene = js.make_scene(h.shape, 1.0, ANGLE)
@@ -225,7 +225,7 @@ def test_gradients_agree_with_differences(scheme, neighbours):
         assert float(jnp.sum(slope * way)) == pytest.approx(float(difference), rel=1e-4, abs=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.long
 def test_an_isotropic_pile_converges_to_the_cone():
     sides = np.array([33, 65, 129])
@@ -242,7 +242,7 @@ def test_an_isotropic_pile_on_a_slope():
     assert errors[1] < 0.55 * errors[0]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_an_isotropic_overfilled_table_drains_to_its_roof():
     errors = [piles.table(n) for n in (24, 48)]
     assert errors[1] < 0.02

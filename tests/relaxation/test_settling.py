@@ -110,7 +110,7 @@ def test_jit_equals_eager_and_vmap_equals_a_loop(dtype):
     assert np.array_equal(eager, js.settle(scene, maps[1], stop=js.Sweeps(3)).height)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_vmap_over_materials():
     h = rough((16, 16), "float64")
     angles = jnp.radians(jnp.array([10.0, 29.0, 45.0]))
@@ -212,7 +212,7 @@ def test_outcome_names_a_bound_that_is_too_small():
     js.check(js.settle(scene, h))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("neighbours", "limit"), [(4, 1 / 4), (8, 1 / (2 + 2 * math.sqrt(2)))])
 def test_the_stable_range_is_where_the_checkerboard_stops_shrinking(neighbours, limit):
     """Just inside the range a steep checkerboard calms down; just outside it is refused, and would grow."""
@@ -242,7 +242,7 @@ def test_the_stable_range_is_where_the_checkerboard_stops_shrinking(neighbours, 
 ANGLES, SPACINGS, SEEDS = st.floats(0.01, 89.9), st.sampled_from([1e-6, 1e-2, 1.0, 1e3]), st.integers(0, 2**32 - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @given(st.sampled_from([(1, 1, 8), (1, 9, 4), (7, 2, 8), (8, 9, 4), (9, 9, 8)]), ANGLES, SPACINGS, SEEDS)
 @settings(max_examples=50, deadline=None)
 def test_any_small_map_settles_or_says_why(size, degrees, spacing, seed):
@@ -288,7 +288,7 @@ def test_cliffs_and_spikes_of_a_million_cells(dtype, height):
     assert int(s.outcome) in (0, js.Outcome.NOT_STILL)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.compiled
 def test_draining_keeps_account_of_every_quantum():
     h = np.full((49, 49), 1.0, "float32")
@@ -323,7 +323,7 @@ def test_a_large_offset_ends_in_bounded_time_and_says_so():
     assert (int(s.outcome) == 0) == (float(s.residual) <= 1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_height_rules_the_dtype():
     scene = js.make_scene((4, 4), np.float64(0.01), jnp.float32(0.5))
     for dtype in (jnp.float16, jnp.bfloat16, jnp.float32, jnp.float64):

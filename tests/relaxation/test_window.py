@@ -23,7 +23,7 @@ def sand(window=None, shape=SHAPE):
     return js.make_scene(shape, DX, ANGLE, tool=js.Blade(0.02, 0.015, 0.0075), window=window)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(
     ("shape", "sizes"),
@@ -51,7 +51,7 @@ def test_equal_or_flagged(shape, sizes):
         assert exact[size] == (12, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize("many", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_the_default_tolerance_keeps_the_difference_small(many):
@@ -71,7 +71,7 @@ def test_an_unsettled_map_is_flagged():
         js.check(out)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_window_at_the_map_edge_with_everything_in_it():
     """Windows cut walls, angles and draining edges as well."""
     solid = np.zeros(SHAPE, bool)
@@ -115,7 +115,7 @@ def heaps(many=24):
     return h
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(
     ("scheme", "neighbours"),

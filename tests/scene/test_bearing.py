@@ -70,7 +70,7 @@ def test_quadrature(s, slip):
     np.testing.assert_allclose(got.torque, r * over(tau), rtol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_order_of_the_quadrature(monkeypatch):
     """In sqrt(1 - t / t_1) the pressure's power at the entry is mild: of order seven in the number of nodes, for n = 0.8."""
 
@@ -158,7 +158,7 @@ def test_shallow_sinkage_is_bekkers(n):
     np.testing.assert_allclose(sinkage(s, 0.25, 0.15, load, 0.0), z, rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sinkage_by_all_that_it_depends_on():
     def z(v):
         soil = replace(WONG_DRY_SAND, **dict(zip(names, v[4:], strict=True)))

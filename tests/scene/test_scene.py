@@ -92,7 +92,7 @@ def test_bad_input(name):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_checks_let_traced_values_pass():
     def height(spacing, angle, width):
         return js.settle(js.make_scene(SHAPE, spacing, angle, tool=js.Blade(width)), LEVEL).height.sum()

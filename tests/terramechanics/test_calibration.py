@@ -37,7 +37,7 @@ def off(found, degrees):
     return math.degrees(found.values["repose_angle"]) - degrees
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.long
 @pytest.mark.parametrize("seeds", [range(0, 24, 5), pytest.param(range(24), marks=pytest.mark.slow)], ids=len)
 def test_one_noisy_collapse_tells_the_angle_and_how_well(seeds):
@@ -96,7 +96,7 @@ def ridge(degrees, half, height):
     return (np.tile(row.reshape(32, parts).mean(1), (32, 1)).astype(np.float32) for row in rows)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.long
 @pytest.mark.parametrize("neighbours", [pytest.param(4, marks=pytest.mark.slow), 8])
 def test_ridges_and_slots_have_small_error_bars_that_hold_the_exact_angle(neighbours):
@@ -115,7 +115,7 @@ def test_ridges_and_slots_have_small_error_bars_that_hold_the_exact_angle(neighb
     assert np.median(errors) < 0.6
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.long
 def test_the_grids_error_is_told_through_gaps():
     """Half of the cone unseen: the same error of the grid."""
@@ -131,7 +131,7 @@ def test_the_grids_error_is_told_through_gaps():
     assert gaps.covariance[0, 0] == pytest.approx(gaps.errors["repose_angle"] ** 2)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.long
 def test_an_error_that_is_not_known_is_no_number():
     """Left out, or with the sand's own angle beyond the range: the verdict says so, and the rest is the noise's."""
@@ -149,7 +149,7 @@ def test_an_error_that_is_not_known_is_no_number():
             assert math.isnan(part["repose_angle"])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("push", [js.SwathPush(), pytest.param(js.SteppedPush(), marks=pytest.mark.slow)])
 def test_a_push_tells_the_angle_and_the_blade(push):
     """To rounding without noise, from lengths off by half; within four standard errors with it."""
@@ -252,7 +252,7 @@ def test_a_linear_fit_is_that_of_the_normal_equations():
     assert found.converged
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_mixtures_and_rivals_are_said():
     """Only the sum of two is told; and two wells of equal depth."""
     rng = np.random.default_rng(1)
@@ -272,7 +272,7 @@ def section(run, profile, seed, guess):
     return js.Section(Pass(run.slip_angle, run.sinkage * guess, repose_angle=math.radians(20)), x, z)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sections_of_a_trench_tell_the_angle_and_the_sinkage():
     """The closed form found again by itself, one angle for all slip angles; shift and lift of the scanner with it."""
     runs = [Pass(math.radians(beta), 0.015, repose_angle=math.radians(33)) for beta in (0, 22.5, 45, 67.5, 90)]
@@ -290,7 +290,7 @@ def test_sections_of_a_trench_tell_the_angle_and_the_sinkage():
     assert placed.values["lift"] == pytest.approx(-0.001, abs=2e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_deep_trench_is_the_exact_relaxations():
     """At 25 mm and 45 degrees the closed form is another profile, and is told so."""
     run = Pass(math.radians(45), 0.025)

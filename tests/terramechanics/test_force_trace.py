@@ -39,7 +39,7 @@ def channel():
     return feel(CHANNEL, np.zeros(BED), PATH, CLEAN, substeps=8)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_force_grows_with_the_heap(channel):
     """It is that of the exact triangle once the heap is a few cells long."""
     shaped, trace = channel
@@ -108,7 +108,7 @@ def roll(wheel, path=ROLL, height=LEVEL, soil=None):
     return rolling(js.make_scene(SHAPE, 0.01, ANGLE, tool=wheel), height, np.asarray(path), soil)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_loaded_wheel_pulls_along_its_way():
     trace = roll(DRIVEN)
     sinkage = wheel_sinkage(LETE_SAND, 0.03, 0.03, 5.0, 0.2)
@@ -124,7 +124,7 @@ def test_a_loaded_wheel_pulls_along_its_way():
     assert per_metre > force.resistance  # what slips costs more than the rut
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_wheel_at_a_height_feels_its_sinkage_in_the_ground_as_found():
     wheel, ground = js.Wheel(radius=0.03, width=0.03), np.full(SHAPE, 0.02)
     path = np.column_stack([ROLL[:2], [0.015, 0.025]])

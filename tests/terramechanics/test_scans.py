@@ -219,7 +219,7 @@ def test_the_median_covers_what_any_scan_covers():
     assert np.all(np.isnan(m.spread[np.abs(m.x) > 0.081]))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(
     ("count", "low", "high", "most"), [(1, -0.5, -0.1, 1.5), (2, -0.35, -0.05, 0.9), (12, -0.2, 0.05, 0.4)]
 )

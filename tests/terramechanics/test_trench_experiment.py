@@ -28,7 +28,7 @@ def of(rows, **what):
     return [row for row in rows if all(row[key] == value for key, value in what.items())]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_every_row_is_there(table):
     report, profiles = table
     rows = report["rows"]
@@ -45,7 +45,7 @@ def test_every_row_is_there(table):
     assert set(profiles) == {*rules, "closed-form", "exact", *aligned}
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_sections_are_steady_and_keep_their_area(table):
     report, profiles = table
     assert max(row["unsteady_mm"] for row in report["rows"] if "unsteady_mm" in row) < 0.3
@@ -119,7 +119,7 @@ def test_error_against_spacing_and_the_papers_case_are_measured():
     assert max(best["error"], paper["error"]) < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = ["trench", "--spacing-mm", "8", "--rule", "split", "--measured", str(FIXTURE), "--out", "out", "--json"]

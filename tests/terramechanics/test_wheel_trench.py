@@ -103,7 +103,7 @@ def test_peaks_of_symmetric_trenches_follow_from_the_toes():
         assert profile.peaks == pytest.approx((total * (1 - math.sqrt(0.5)),) * 2, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("trench", TRENCHES)
 def test_relaxed_sections_are_those_of_the_table(exact, trench):
     """The table's are of sampled sections, these of mean ones: a bit apart where a peak or a bottom is sharp."""
@@ -128,7 +128,7 @@ def test_relaxing_sampled_sections_gives_the_table():
     assert depths == pytest.approx([TABLE[trench][1] for trench in TRENCHES[-4:]], abs=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_relaxed_sections_converge_with_the_spacing(exact):
     coarse, middle, fine = (exact[spacing] for spacing in (1e-3, 5e-4, 2.5e-4))
     steps = [max(apart(a[trench], b[trench]) for trench in TRENCHES) for a, b in ((coarse, middle), (middle, fine))]
@@ -152,7 +152,7 @@ def test_relaxed_sand_lies_at_repose_and_within_its_toes(exact):
         assert np.abs(np.subtract(profile.toes, closed_form(one).toes)).max() < 2e-3
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_areas_are_kept(exact):
     for one in [*RUNS, *GROUSED, *EDGES]:
         for profile in (closed_form(one), unsettled(one)):
@@ -192,7 +192,7 @@ PASSES = st.builds(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @settings(max_examples=1000, deadline=None, derandomize=True, database=None)
 @given(PASSES)
 def test_a_closed_form_is_sound_or_refused(one):

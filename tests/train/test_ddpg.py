@@ -32,7 +32,7 @@ def bits(state):
     return [np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x) for x in leaves]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_time_limit_is_no_end_and_a_terminated_step_has_no_value_ahead():
     learner = prober(Constant())
     agent = learner.init(0).agent
@@ -68,7 +68,7 @@ def test_slow_copies_follow_by_a_share():
     assert any(np.any(a != b) for a, b in zip(bits(after.critic), bits(before.critic), strict=True))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_updates_of_many_agents_at_once_are_each_one_s_own():
     learner = prober(ByBoth())
     one = learner.init(0).agent
@@ -101,7 +101,7 @@ def test_many_seeds_at_once_learn_what_each_learns_alone():
     assert len({float(x) for x in metrics["loss"]}) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_chunk_follows_from_the_state_alone_and_a_run_can_be_gone_on_with(tmp_path):
     learner = prober(Late())
     run(learner, tmp_path / "whole", 5, steps=8)
@@ -154,7 +154,7 @@ def acts():
     return Acts(actor, critic, of_actor, of_critic, 0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_its_policy_proposes_strokes_ranked_by_the_critic_its_own_alone(acts):
     scene = usual_scene()
     env, params = MultiStroke(), StrokeParams(scene, LevelGoals(jnp.zeros((1, 32, 32), jnp.float32)))

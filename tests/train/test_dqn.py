@@ -58,7 +58,7 @@ ASKED = [  # the other way to targets, and the other questions, are as long in c
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize(("question", "backup"), ASKED, ids=lambda x: type(x).__name__)
 def test_a_probe_s_known_values_are_found(question, backup):
     probe = Probe(question, Two())
@@ -98,7 +98,7 @@ def test_dueling_advantages_have_no_mean_and_a_constant_in_them_changes_nothing(
     np.testing.assert_allclose(out[:, 0] - out[:, 2], advantage[:, 0] - advantage[:, 2], atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_bins_reach_the_targets_that_they_can_write_and_stay_within_their_bounds():
     head, targets = Bins(-3.0, 1.0, 9), jnp.array([-3.0, -1.3, 0.2, 1.0, 9.0])
     raw = jnp.zeros((5, 9))
@@ -133,7 +133,7 @@ def test_the_sampled_target_is_the_slow_value_of_what_the_online_network_likes_a
     np.testing.assert_array_equal(weights, [[0, 1, 0, 0]])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_targets_of_every_action_follow_the_model_and_no_walk_that_came_to_its_end_is_undercut():
     task = SingleStroke(OnMap((1, 4)))
     params = MapParams(map_pool([LINE], [(0, 1)]), step_cost=1.0)
@@ -156,7 +156,7 @@ def test_targets_of_every_action_follow_the_model_and_no_walk_that_came_to_its_e
     assert Every().targets(task, params, 1.0, items, slow, slow)[0][0, 3] == 0  # digs the last cell: a step, less its reward
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_where_there_is_no_room_for_an_action_it_has_no_weight():
     task = SingleStroke(OnMap((3, 3)))
     dig = np.ones((3, 3), bool)
@@ -170,7 +170,7 @@ def test_where_there_is_no_room_for_an_action_it_has_no_weight():
     np.testing.assert_allclose(weights, [[0.25] * 4, [0] * 4])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_only_legal_actions_are_chosen_when_learning_and_when_walking():
     state, _ = QUICK.advance(QUICK.init(3))
     kept, number = state.memory.experience, QUICK.envs * QUICK.steps
@@ -209,7 +209,7 @@ def test_shapes_are_of_one_piece_start_on_a_cell_and_differ():
     assert 12 < cells.mean() < 20
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_letters_and_maps_set_apart_are_never_drawn():
     pool = shape_pool(Shapes(), KEY, 16, (7, 7), jnp.zeros((0, 7, 7), bool))
     barred = pool.dig[jnp.array([0, 1, 5])]
@@ -224,7 +224,7 @@ def test_letters_and_maps_set_apart_are_never_drawn():
     np.testing.assert_array_equal(SingleStroke().barred(look), [True, False])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_chunk_is_a_function_of_the_state():
     state = QUICK.init(0)
     assert same(QUICK.advance(state)[0], QUICK.advance(state)[0])
@@ -267,7 +267,7 @@ class Blind:
         return Greedy(Dqn(width=8, blocks=1).net, state)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_evaluation_counts_what_is_solved_beside_the_planner_and_gives_up_circles():
     net = Dqn(width=8, blocks=1).net
     zero = jax.tree.map(jnp.zeros_like, net.init(KEY, jax.tree.map(jnp.asarray, seen(*[np.eye(7, dtype=bool)] * 2, (0, 0)))))
@@ -305,7 +305,7 @@ def test_a_step_on_a_turned_map_is_the_turned_step(view):
         np.testing.assert_array_equal(end - begin, STEPS[there])
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_what_looks_at_all_views_values_turned_steps_alike():
     net = QNet(around, 4, Mean(), 16, 1)
     dig = np.random.default_rng(0).random((1, 5, 5)) < 0.6

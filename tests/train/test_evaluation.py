@@ -31,7 +31,7 @@ class Knows:
         return np.array(out), np.zeros((len(goal), count))
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_a_policy_that_knows_the_strokes_gets_all_right():
     report = evaluate(Knows(), GLYPHS, Stages())
     assert {key: report[key] for key in ("right", "strict", "total", "stroke_right")} == {
@@ -53,7 +53,7 @@ def test_a_policy_that_knows_the_strokes_gets_all_right():
     assert drawn.axes[0].get_title().startswith(odd.name)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_one_stroke_again_and_again_is_one_right_stroke():
     report = evaluate(Knows(forgets=True), GLYPHS, Stages())
     assert (report["right"], report["strict"], report["stroke_right"]) == (0, 0, 2)

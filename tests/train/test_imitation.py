@@ -55,7 +55,7 @@ def test_plans_are_moved_over_the_whole_map():
     np.testing.assert_allclose(np.ptp(new[..., 1::2], (1, 2)) / np.ptp(old[..., 1::2], (1, 2)), scale)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_strokes_due_lead_to_the_goal():
     start = starts(SCENE, rng(1), 8, rough=0.5)
     lesson = lessons(SCENE, rng(), 8, start)

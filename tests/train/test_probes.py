@@ -31,7 +31,7 @@ def prober(question, **options):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 @pytest.mark.parametrize("question", QUESTIONS, ids=lambda q: type(q).__name__)
 def test_the_critic_and_the_actor_find_a_probe_s_known_values(question):
     learner = prober(question)

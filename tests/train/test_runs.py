@@ -145,7 +145,7 @@ def test_killed_while_it_saves_a_run_goes_on_bit_for_bit(tmp_path, undisturbed, 
     alike(tmp_path / "run", undisturbed)
 
 
-@pytest.mark.slow
+@pytest.mark.wide
 def test_killed_at_any_moment_and_again_a_run_goes_on_bit_for_bit(tmp_path, undisturbed):
     out = tmp_path / "run"
     for lines in (5, 24):
