@@ -95,8 +95,9 @@ def plan_sand(
     of the binary plan (`plan`, on blocks as wide as the blade) are among the children, and the best plans' strokes are then
     varied one at a time. With `Steps`, the binary plan's walk over one piece of what is to dig is among the paths.
 
-    With `Rising` or `Flat` it is greedy: each stroke is the best of many on the sand before it, and the plan's strokes are
-    then varied one at a time. `optimise_strokes(guess=plan.strokes)` goes on from there by gradients.
+    With `Rising` or `Flat` three plans compete: a coverage path, strokes along the plan of least work (optimal transport),
+    and strokes that are each the best of many on the sand before them. The best plan's strokes are then varied one at a
+    time. `optimise_strokes(guess=plan.strokes)` goes on from there by gradients.
 
     Args:
       scene: grid, sand and a `Blade`.
