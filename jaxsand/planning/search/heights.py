@@ -1,8 +1,8 @@
 """The search over strokes with heights: the tool rises or sinks on its way, and so cuts and fills along a slope.
 
-Three plans compete: rows over all that is to be shaped (coverage.py), strokes along the plan of least work (transport.py), and
-strokes that are each the best of many on the sand that those before it left. Both ends of these have heights, drawn from what
-the goal wants there and from the sand that lies there. The strokes of the best plan are then varied one at a time.
+Three plans compete: rows over all that is to be shaped (coverage.py), strokes along the plan of least work (transport.py),
+and strokes that are each the best of many on the sand that those before it left. Both ends of these have heights, drawn from
+what the goal wants there and from the sand that lies there. The strokes of the best plan are then varied one at a time.
 """
 
 import numpy as np
