@@ -115,7 +115,6 @@ def heaps(many=24):
     return h
 
 
-@pytest.mark.wide
 @pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(
     ("scheme", "neighbours"),
