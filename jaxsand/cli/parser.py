@@ -88,7 +88,7 @@ def _shape(commands: Any) -> None:
         type=path_name,
         metavar="MASK",
         help="search, optimise, policy: cells of a .npy goal where any height will do, as its NaN cells: a .png (dark is "
-        "free; first row on top) or a .npy of booleans (first row at y = 0)",
+        "free; first row on top) or a .npy of booleans (first row as in the goal)",
     )
     p.add_argument("--out", type=path_name, metavar="DIR", help="folder to write to (shape-GOAL)")
     p.add_argument("--json", action="store_true", help="print one JSON object")

@@ -252,11 +252,16 @@ def _goal_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
             raise ValueError(f"{error}; or use --method search or optimise, to which they are free") from None
     heights = read_heights(existing(path), options.no_data).astype(float)
     heights = heights[::-1] if options.first_row == "top" else heights
-    return heights if options.free is None else np.where(_free(Path(options.free), heights.shape), np.nan, heights)
+    if options.free is None:
+        return heights
+    mask = _free(Path(options.free), heights.shape)
+    if options.first_row == "top" and Path(options.free).suffix.lower() == ".npy":
+        mask = mask[::-1]
+    return np.where(mask, np.nan, heights)
 
 
 def _free(path: Path, shape: tuple[int, ...]) -> "np.ndarray":
-    """The free cells of a mask: the dark ones of a picture, or those of a .npy that are not 0; row 0 at y = 0."""
+    """The free cells of a mask: the dark ones of a picture, or those of a .npy that are not 0, its rows as they come."""
     import numpy as np
 
     from jaxsand.goals.letters import read_image

@@ -117,8 +117,10 @@ class Weighted:
     def __post_init__(self) -> None:
         for name in ("above", "below"):
             value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0 <= value < np.inf):
+            if not (isinstance(value, int | float | np.number) and 0 <= value < np.inf):
                 raise ValueError(f"measure.{name}: got {value!r}; give a weight of 0 or more")
+        if not self.above and not self.below:
+            raise ValueError("measure: got weights of 0 above and below, which count nothing; give one above 0")
         if self.power not in (1, 2):
             raise ValueError(f"measure.power: got {self.power!r}; give 1 or 2")
 

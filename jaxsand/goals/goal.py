@@ -35,7 +35,11 @@ class Goal:
         power: p, 2 or 1. Squares spread what is left evenly; with 1 the cost is a mean difference, and a few cells may be
             far off.
 
-    `cost` and `distance` take numpy or JAX arrays, and are differentiable in every map (with p = 1 not at the goal).
+    `cost` and `distance` take numpy or JAX arrays, and are differentiable in the heights, the goal and the weights, but not
+    at the goal: `distance`, and `cost` with p = 1, have a kink there, and a derivative of 0.
+
+    Raises:
+        ValueError: for another power, or a list that is no array of numbers.
 
     Example:
         >>> import jax.numpy as jnp
@@ -50,6 +54,17 @@ class Goal:
     below: ArrayLike = 1.0
     power: Power = field(default=2, metadata={"static": True})
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.power, int | float) or self.power not in (1, 2):
+            raise ValueError(f"goal.power: got {self.power!r}; give 1 or 2")
+        for name in ("height", "above", "below"):
+            value: Any = getattr(self, name)
+            if isinstance(value, list | tuple | np.ma.MaskedArray):
+                try:
+                    object.__setattr__(self, name, np.asarray(gaps(value)))
+                except ValueError:
+                    raise ValueError(f"goal.{name}: got rows of different lengths; give a map [H, W]") from None
+
     @property
     def free(self) -> Any:
         """Which cells may have any height, booleans [H, W]."""
@@ -60,10 +75,14 @@ class Goal:
 
         `height - off(height)` is the nearest map that costs nothing. A height that is not finite stays so.
         """
-        xp = _space(height, self.height)
-        apart = height - xp.where(xp.isnan(self.height), height, self.height)
+        xp, apart = _space(height, self.height), self.apart(height)
         costs = ((apart > 0) & (xp.asarray(self.above) > 0)) | ((apart < 0) & (xp.asarray(self.below) > 0))
         return xp.where(costs | ~xp.isfinite(apart), apart, 0)
+
+    def apart(self, height: Any) -> Any:
+        """How far a map [..., H, W] stands above the goal (m), whether or not that costs; 0 where the goal is NaN."""
+        xp = _space(height, self.height)
+        return height - xp.where(xp.isnan(self.height), height, self.height)
 
     def weight(self, off: Any) -> Any:
         """The weight that differences of this sign have: of the one above where `off` is above 0, else of the one below."""
@@ -73,13 +92,15 @@ class Goal:
         """Differences r such that the cost is sum |r|^p, and their derivatives by the heights."""
         off = self.off(height)
         rate = self.weight(off) ** (1 / self.power)
-        return off * rate, _space(off).where(off == 0, 0, rate)
+        xp = _space(off, rate)
+        one = xp.asarray(self.above) == xp.asarray(self.below)
+        return off * rate, xp.where((off == 0) & ~one, 0, rate)  # beside a kink, a cell at the goal may go either way
 
     def cost(self, height: Any) -> Any:
         """J of maps [..., H, W]: [...] (m^2, or m for p = 1)."""
-        off = self.off(height)
-        size = off**2 if self.power == 2 else abs(off)
-        return (self.weight(off) * size).sum((-2, -1))
+        apart = self.apart(height)
+        size = apart**2 if self.power == 2 else abs(apart)
+        return (self.weight(apart) * size).sum((-2, -1))
 
     def slope(self, height: Any) -> Any:
         """The derivative of the cost by the heights, [..., H, W]; 0 at the goal."""
@@ -103,11 +124,9 @@ def as_goal(scene: Scene, goal: Goal | ArrayLike, name: str = "goal") -> Goal:
         neither 1 nor 2.
     """
     given = goal if isinstance(goal, Goal) else Goal(goal)
-    if given.power not in (1, 2):
-        raise ValueError(f"{name}.power: got {given.power!r}; give 1 or 2")
-    height = np.array(gaps(given.height))
+    height = np.array(gaps(given.height)) if not isinstance(given.height, Goal) else np.array(None)
     if height.dtype.kind not in "fiub":
-        raise ValueError(f"{name}: got {short(given.height)}; give a height map [H, W] of numbers (m)")
+        raise ValueError(f"{name}: got {type(given.height).__name__}; give a height map [H, W] of numbers (m)")
     height = height.astype(float)
     above, below = (_weights(f"{name}.{side}", getattr(given, side), scene) for side in ("above", "below"))
     if height.shape == scene.grid.shape:

@@ -68,7 +68,7 @@ def make_task(name: str, key: int = 0) -> Task:
         >>> task.scene.grid.shape, task.strokes
         ((16, 32), 24)
     """
-    if name not in TASKS:
+    if not isinstance(name, str) or name not in TASKS:
         raise ValueError(f"name: got {name!r}; give one of {', '.join(TASKS)}")
     check_whole("key", key, 0)
     return TASKS[name](np.random.default_rng(key))
@@ -88,6 +88,9 @@ def figures(task: Task, height: Map) -> dict[str, float | None]:
         task: the task.
         height: the map [H, W] (m) that came of it.
 
+    Raises:
+        ValueError: for a map of another shape.
+
     Example:
         >>> import jaxsand as js
         >>> task = js.tasks.make_task("box-trench", key=0)
@@ -96,12 +99,14 @@ def figures(task: Task, height: Map) -> dict[str, float | None]:
         (True, 0.0, 0.0)
     """
     height, start = np.asarray(height, float), np.asarray(task.start, float)
+    if height.shape != start.shape:
+        raise ValueError(f"height: got shape {list(height.shape)}, the task has {list(start.shape)}; give one map [H, W]")
     wanted = np.where(np.isnan(task.goal.height), start, task.goal.height)
     asked = np.where(task.cells, wanted - start, 0)
     largest = float(np.abs(asked).max())
     dig = asked < -_CHANGED * largest
     deep = height <= wanted + _CHANGED * largest
-    others = ~task.cells & ~task.goal.free
+    others = ~task.cells & ~task.goal.free & (np.asarray(task.goal.below) > 0)
     before, after = (float(task.goal.distance(h)) for h in (start, height))
     return {
         "mean_mm": 1e3 * float(np.abs(height - wanted)[task.cells].mean()),
@@ -125,7 +130,7 @@ def _level(rng: np.random.Generator) -> Task:
 
 
 def _pad(rng: np.random.Generator) -> Task:
-    """A level square of 0.3 x 0.16 m in rough ground of 40 mm relief, at the ground's mean height there."""
+    """A level place of 0.28 x 0.16 m in rough ground of 40 mm relief, at the ground's mean height there."""
     scene = _scene((16, 32), 0.02, Blade(width=0.1, thickness=0.03, depth=0.0))
     start = _rested(scene, rough_surface(rng, scene.grid.shape, 0.04, 1.0))
     x, y = _places(scene)
@@ -134,7 +139,7 @@ def _pad(rng: np.random.Generator) -> Task:
 
 
 def _ramp(rng: np.random.Generator) -> Task:
-    """A ramp 0.3 m long and 0.16 m wide that climbs 40 to 60 mm either way, cut and filled from half its height."""
+    """A ramp 0.28 m long and 0.16 m wide that climbs 40 to 60 mm in 0.3 m either way, from sand at half its height."""
     scene = _scene((16, 32), 0.02, Blade(width=0.1, thickness=0.03, depth=0.0))
     x, y = _places(scene)
     cells = (abs(x - 0.32) < 0.15) & (abs(y - 0.16) < 0.08)
@@ -233,7 +238,7 @@ def _corner(rng: np.random.Generator) -> Task:
 
 
 def _polygon(rng: np.random.Generator) -> Task:
-    """A polygon 75 to 100 mm wide and 10 to 30 mm deep, with one or two smaller ones in it, after Kreis et al. 2025."""
+    """A polygon 75 to 100 mm wide and 10 to 30 mm deep, with one or two smaller, deeper ones, after Kreis et al. 2025."""
     outline, depth = _round(rng), rng.uniform(0.01, 0.03)
     steps = [(outline, depth)]
     for _ in range(rng.integers(1, 3)):
@@ -243,7 +248,7 @@ def _polygon(rng: np.random.Generator) -> Task:
 
 
 def _vertical(rng: np.random.Generator) -> Task:
-    """One of the shapes above with walls that no dry sand can keep."""
+    """One of the shapes above as it is drawn, with vertical walls, which sand keeps only where they are low."""
     shape = (_l_shape, _round, lambda r: rectangle(r.uniform(0.06, 0.2), r.uniform(0.04, 0.06)))[rng.integers(3)](rng)
     return _at_rest(rng, "vertical", [(shape, rng.uniform(0.005, 0.02))], rest=False)
 

@@ -21,7 +21,7 @@ def why_no_strokes(scene: Scene, start: np.ndarray, goal: Goal) -> str:
     if isinstance(scene.walls, Walls):
         change = np.where(np.asarray(scene.walls.solid), 0, change)
     if not change.any():
-        return "the sand lies as the goal has it already; nothing is to be done"
+        return "the sand lies as the goal has it already, where that counts; nothing is to be done"
     everywhere = bool(np.all(np.asarray(goal.above) > 0) and np.all(np.asarray(goal.below) > 0))
     which = "over the whole map, where berms count" if everywhere else "where its height counts"
     reason = f"no stroke that was tried brings the sand nearer to the goal, {which}"

@@ -38,13 +38,17 @@ def waypoints(scene: Scene, paths: Sequence[np.ndarray], clear: float) -> np.nda
     found = []
     for path in paths:
         points = np.asarray(path, float)
+        if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points) or not np.all(np.isfinite(points)):
+            raise ValueError(
+                f"paths: got one of shape {list(points.shape)}; give finite points [k, 2] or [k, 3] (m) of each"
+            )
         if points.shape[1] == 2:
             if not isinstance(scene.tool, Blade | Bucket):
                 raise ValueError(
                     f"scene.tool: got {type(scene.tool).__name__}, which has no depth; give paths [n, 3] = x, y, z"
                 )
             points = np.column_stack([points, np.full(len(points), -float(scene.tool.depth))])
-        if not points[:, 2].max() <= clear:
+        if not points[:, 2].max() <= clear < np.inf:
             raise ValueError(
                 f"clear: got {clear}; give a height of at least {points[:, 2].max():.6g}, the highest of a path"
             )
@@ -53,12 +57,13 @@ def waypoints(scene: Scene, paths: Sequence[np.ndarray], clear: float) -> np.nda
     return np.array(found).reshape(-1, len(FIELDS))
 
 
-def write_waypoints(file: Path, places: np.ndarray) -> None:
+def write_waypoints(file: Path | str, places: np.ndarray) -> None:
     """Writes waypoints [n, 4] as .csv, with a line of names first, or as .json, a list of objects; lengths are in metres.
 
     Raises:
         ValueError: for another kind of file.
     """
+    file = Path(file)
     rows = [[*map(float, place[:3]), bool(place[3])] for place in places]
     if file.suffix == ".json":
         file.write_text(json.dumps([dict(zip(FIELDS, row, strict=True)) for row in rows], indent=1) + "\n", encoding="utf-8")

@@ -64,6 +64,24 @@ def test_the_nearest_map_costs_nothing_and_free_cells_keep_their_sand():
     assert np.isnan(goal.off(np.full(SHAPE, np.nan))).all()  # what is not finite is not hidden by a free cell
 
 
+def test_powers_and_ragged_lists_are_refused_at_once():
+    for power in (3, np.array([1, 2])):
+        with pytest.raises(ValueError, match=r"goal.power: got .*; give 1 or 2"):
+            js.Goal(LEVEL, power=power)
+    with pytest.raises(ValueError, match="goal.height: got rows of different lengths"):
+        js.Goal([[1.0, 2.0], [3.0]])
+
+
+def test_lists_and_masks_are_read_as_the_planners_do():
+    assert js.Goal(np.ma.masked_equal(np.full((2, 3), 99.0), 99.0)).cost(np.ones((2, 3))) == 0
+    assert js.Goal([[0.0, 0.0]], above=[[1, 0]], below=[[1, 0]]).free.tolist() == [[False, True]]
+
+
+def test_derivatives_by_weights_are_what_stands_too_high_even_where_they_are_0():
+    by_weight = jax.grad(lambda a: js.Goal(jnp.zeros((1, 2)), above=a).cost(jnp.array([[0.1, 0.2]])))
+    np.testing.assert_allclose(by_weight(jnp.array([[0.0, 1.0]])), [[0.01, 0.04]])
+
+
 def test_what_is_no_number_costs_nothing():
     goal = Goal(np.array([[np.nan, 0.0]]))
     assert goal.cost(np.array([[1.0, 2.0]])) == goal.cost(jnp.array([[1.0, 2.0]])) == 4.0
@@ -109,11 +127,11 @@ def test_one_stroke_gains_no_more_than_the_weighted_bound(power):
         (js.Goal(LEVEL, above=-1.0), r"goal.above: got -1.0; give a weight of 0 or more, or a map .* \[6, 7\]"),
         (js.Goal(LEVEL, below=LEVEL[:3]), r"goal.below: got an array of shape \[3, 7\]"),
         (js.Goal(LEVEL, below=np.nan), "goal.below: got nan"),
-        (js.Goal(LEVEL, power=3), "goal.power: got 3; give 1 or 2"),
         (js.Goal(LEVEL[:3]), r"goal: got shape \[3, 7\]"),
         (js.Goal(LEVEL, 0.0, 0.0), "goal: got NaN, free, in every cell"),
         (js.Goal(LEVEL + np.inf), "goal: got 42 cells that are not finite"),
-        ("none", "goal: got 'none'; give a height map"),
+        ("none", "goal: got str; give a height map"),
+        (js.Goal(js.Goal(LEVEL)), "goal: got Goal; give a height map"),
     ],
 )
 def test_goals_that_make_no_sense_are_refused(goal, message):

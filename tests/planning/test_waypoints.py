@@ -37,6 +37,11 @@ def test_files_hold_every_digit(tmp_path, kind):
 def test_what_cannot_be_replayed_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"clear: got 0.0; give a height of at least 0.01"):
         waypoints(SCENE, [RISING], 0.0)
+    for path in (np.zeros(4), np.zeros((2, 4)), np.zeros((0, 2)), np.full((2, 3), np.nan)):
+        with pytest.raises(ValueError, match="paths: got one of shape"):
+            waypoints(SCENE, [path], CLEAR)
+    with pytest.raises(ValueError, match="clear: got inf"):
+        waypoints(SCENE, [FLAT], np.inf)
     with pytest.raises(ValueError, match=r"scene.tool: got Wheel, which has no depth; give paths \[n, 3\]"):
         waypoints(js.make_scene((8, 8), 0.01, tool=js.Wheel(0.03, 0.02, 0.01)), [FLAT], CLEAR)
     with pytest.raises(ValueError, match=r"file: got .*plan.txt'; give a name that ends in \.csv or \.json"):

@@ -21,13 +21,14 @@ def coverage_paths(job: Job, budget: float, rng: np.random.Generator) -> Found:
 
 def random_strokes(job: Job, budget: float, rng: np.random.Generator) -> Found:
     """Random strokes between places that count: the best plan of as many as the budget allows."""
-    count = max(1, int(budget / job.strokes))
-    ways = [propose_heights(job, job.height, count, rng) for _ in range(job.strokes)]
+    strokes = min(job.strokes, int(budget))
+    count = int(budget / strokes)
+    ways = [propose_heights(job, job.height, count, rng) for _ in range(strokes)]
     maps = np.repeat(job.height[None], count, axis=0)
     for way in ways:
         maps = pushed(job.scene, maps, way)
     ends = distance(maps, job.goal)
-    return (np.stack(ways)[:, int(ends.argmin())], float(ends.min())), Effort(full=count * job.strokes)
+    return (np.stack(ways)[:, int(ends.argmin())], float(ends.min())), Effort(full=count * strokes)
 
 
 def transported(job: Job, budget: float, rng: np.random.Generator) -> Found:

@@ -146,7 +146,7 @@ def plan_sand(
         bound = volume_distance(scene, height, wanted)
     else:
         bound = least_distance(scene, height, wanted, strokes, longest_stroke(scene, actions))
-    estimate = max(0.0, before - strokes * effort.gain)
+    estimate = min(left, max(0.0, before - strokes * effort.gain))
     reason = None if paths else why_no_strokes(scene, height, wanted)
     return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason)
 

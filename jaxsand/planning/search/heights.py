@@ -59,7 +59,7 @@ def least_work(job: Job, budget: float) -> tuple[Ended, Effort]:
         maps.append(after)
         plan = np.concatenate([plan, stroke])
     ends = distance(np.stack(maps), job.goal)
-    return (plan[: int(ends.argmin())], float(ends.min())), effort
+    return (plan[: int(ends.argmin())], float(ends.min())), effort + Effort(gain=_gain(ends))
 
 
 def best_coverage(job: Job, budget: float) -> tuple[Ended, Effort]:
@@ -80,7 +80,13 @@ def best_coverage(job: Job, budget: float) -> tuple[Ended, Effort]:
         maps[some] = pushed(job.scene, maps[some], np.stack([plans[i][k] for i in some]))
         ends.append(distance(maps, job.goal))
     rows, best = np.unravel_index(int(np.argmin(ends)), (len(ends), len(plans)))
-    return (plans[best][:rows], float(np.min(ends))), Effort(full=cost)
+    return (plans[best][:rows], float(np.min(ends))), Effort(full=cost, gain=_gain(np.stack(ends)))
+
+
+def _gain(ends: np.ndarray) -> float:
+    """The largest step (m) towards the goal among distances [n, ...] after each stroke; 0 if there is none."""
+    steps = (ends[:-1] - ends[1:])[np.isfinite(ends[1:]) & np.isfinite(ends[:-1])]
+    return max(0.0, float(steps.max(initial=0.0)))
 
 
 def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[Ended, Effort]:
@@ -122,16 +128,18 @@ def propose_heights(job: Job, height: np.ndarray, count: int, rng: np.random.Gen
     """Draws random strokes [count, 6] (m) that may bring `height` [H, W] closer to the job's goal.
 
     A quarter each run from where sand can be had to where it is wanted, from there to anywhere that counts, between places
-    that count, and between any. Sand can be had where it lies above the goal, and where the goal is free. The first are as
-    high as the goal at their ends, or as the sand where the goal is free, and half of them start lower. The others follow
-    the straight line that fits the goal best along their way. Two thirds are then moved a little up or down.
+    that count, and between any. Sand can be had where it lies above the goal, costly or not, and where the goal is free. The
+    first are as high as the goal at their ends, or as the sand where the goal is free, and half of them start lower. The
+    others follow the straight line that fits the goal best along their way. Two thirds are then moved a little up or down.
     """
     spacing = float(job.scene.grid.spacing)
     todo, free, goal = job.goal.off(height), job.goal.free, np.asarray(job.goal.height)
     anywhere, none = np.full(todo.size, 1 / todo.size), np.zeros(todo.size)
     counts = shares(~free.ravel() * 1.0, anywhere)
     wanted = shares(-todo.ravel(), counts)
-    had = shares(shares(todo.ravel(), none) + 0.5 * shares(free.ravel() * 1.0, none), anywhere)
+    had = shares(
+        shares(job.goal.apart(np.asarray(height, float)).ravel(), none) + 0.5 * shares(free.ravel() * 1.0, none), anywhere
+    )
     many = count // 4 + 1
     pairs = ((had, wanted), (had, counts), (counts, counts), (anywhere, anywhere))
     cells = np.stack([[rng.choice(todo.size, many, p=share) for share in pair] for pair in pairs], axis=1)

@@ -41,14 +41,14 @@ def flows(goal: Goal, height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
     how much (a sum of heights, m).
 
     It is the optimal transport from what is too high to what is too low, in blocks of a few cells: the sum of amount times
-    distance is least. What is left over goes to the nearest cell where a heap may lie, and what is lacking comes from the
-    nearest that is free; where there is none, it stays as it is.
+    distance is least. What is left over goes to the nearest cell where a heap may lie, or into a hole that may be filled;
+    what is lacking comes from the nearest that is free, or a heap that may go. Where there is none, it stays as it is.
     """
-    off = goal.off(np.asarray(height, float))
+    off, apart = goal.off(np.asarray(height, float)), goal.apart(np.asarray(height, float))
     had, much = _blocks(np.maximum(off, 0))
     wanted, little = _blocks(np.maximum(-off, 0))
-    room = np.argwhere((np.asarray(goal.above) == 0) & (off == 0))
-    lent = np.argwhere(goal.free)
+    room = np.argwhere(((np.asarray(goal.above) == 0) | (apart < 0)) & (off == 0))
+    lent = np.argwhere(goal.free | ((apart > 0) & (off == 0)))
     dear = 10.0 * sum(off.shape)
     work = np.full((len(had) + 1, len(wanted) + 1), dear)
     work[:-1, :-1] = cdist(had, wanted)
