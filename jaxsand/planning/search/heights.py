@@ -18,7 +18,7 @@ _ROUNDS = 4  # of trials for a stroke: the first are drawn anew, the others lie 
 _KEPT = 8  # of a stroke's trials, for others around them
 _AROUND = np.array([3.0, 3.0, 0.5, 3.0, 3.0, 0.5])  # how far these lie: in spacings, heights in the size of what is to do
 _COVERAGE = 0.2  # of the budget at most is for coverage paths
-_GREEDY = 0.45  # of the budget is for the strokes one after the other; the rest varies the best plan
+_GREEDY = 0.7  # of what these leave is for the strokes one after the other; the rest varies the best plan
 _VARIANTS = 16  # of a stroke at a time
 _LEAST_WORK = 0.1  # of the budget at most is for a plan of least work
 _PLACES = 17  # on a stroke's way at which the goal is looked at
@@ -37,7 +37,8 @@ def search_heights(job: Job, budget: float, rng: np.random.Generator) -> tuple[l
         found, more = make(job, share * budget)
         plans.append(found)
         effort += more
-    found, more = one_by_one(job, max(_GREEDY * budget, min(budget - effort.cost, job.strokes)), rng)
+    room = budget - effort.cost
+    found, more = one_by_one(job, max(_GREEDY * room, min(room, job.strokes)), rng)
     plan, _ = min([*plans, found], key=lambda one: one[1])
     effort += more
     if len(plan):
