@@ -13,7 +13,8 @@ from jaxsand.goals.tasks import TASKS, Task, figures, make_task
 from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Job, Rising
-from jaxsand.planning.search.rollouts import Effort, pushed
+from jaxsand.planning.search.rollouts import Effort
+from jaxsand.planning.search.strokes import finish
 from jaxsand.scene.progress import Tell, quiet
 
 Method = Callable[[Job, float, np.random.Generator], earth.Found]
@@ -70,9 +71,7 @@ def _one(task: Task, method: str, pushes: int, seed: int) -> dict[str, Any]:
     began = time.perf_counter()
     plan, effort = _planned(task, method, pushes, seed)
     seconds = time.perf_counter() - began
-    maps = [task.start]
-    for stroke in plan:
-        maps.append(pushed(task.scene, maps[-1][None], stroke[None])[0])
+    maps = finish(task.scene, plan[None], 0, task.start[None])[:, 0]
     moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in pairwise(maps))
     return {
         **figures(task, maps[-1]),

@@ -241,17 +241,9 @@ def _goal_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
     """A goal's heights, NaN where it is free: where the file has none or holds the value for no data, or by --free."""
     import numpy as np
 
-    from jaxsand.goals.letters import read_heights
-
     if options.method == "plan":
-        try:
-            return _heights(path, "goal", options)
-        except ValueError as error:
-            if "not finite" not in str(error):
-                raise
-            raise ValueError(f"{error}; or use --method search or optimise, to which they are free") from None
-    heights = read_heights(existing(path), options.no_data).astype(float)
-    heights = heights[::-1] if options.first_row == "top" else heights
+        return _heights(path, "goal", options, "; or use --method search or optimise, to which they are free")
+    heights = _read_heights(path, options).astype(float)
     if options.free is None:
         return heights
     mask = _free(Path(options.free), heights.shape)
@@ -284,13 +276,23 @@ def _free(path: Path, shape: tuple[int, ...]) -> "np.ndarray":
     return mask
 
 
-def _heights(path: Path, field: str, options: argparse.Namespace) -> "np.ndarray":
-    """A height map without gaps, first row at y = 0."""
-    from jaxsand.goals.letters import read_heights
+def _heights(path: Path, field: str, options: argparse.Namespace, remedy: str = "") -> "np.ndarray":
+    """A height map without gaps, first row at y = 0; `remedy` is what else to do about gaps."""
     from jaxsand.goals.metrics import finite
 
+    heights = _read_heights(path, options)
+    try:
+        finite(heights, field)
+    except ValueError as error:
+        raise ValueError(f"{error}{remedy}") from None
+    return heights
+
+
+def _read_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
+    """A height map, NaN where the file holds the value for no data, first row at y = 0."""
+    from jaxsand.goals.letters import read_heights
+
     heights = read_heights(existing(path), options.no_data)
-    finite(heights, field)
     return heights[::-1] if options.first_row == "top" else heights
 
 

@@ -229,7 +229,7 @@ def _relief(rng: np.random.Generator) -> Task:
 def _rectangle(rng: np.random.Generator) -> Task:
     """A rectangle 40 to 60 mm wide and 5 to 20 mm deep, after Kreis et al. 2025, at rest; heaps may lie around it."""
     width, length = rng.uniform(0.04, 0.06), rng.uniform(0.06, 0.2)
-    return _at_rest(rng, "rectangle", [(rectangle(length, width), rng.uniform(0.005, 0.02))])
+    return _at_rest(rng, "rectangle", [(_oblong(length, width), rng.uniform(0.005, 0.02))])
 
 
 def _corner(rng: np.random.Generator) -> Task:
@@ -249,7 +249,7 @@ def _polygon(rng: np.random.Generator) -> Task:
 
 def _vertical(rng: np.random.Generator) -> Task:
     """One of the shapes above as it is drawn, with vertical walls, which sand keeps only where they are low."""
-    shape = (_l_shape, _round, lambda r: rectangle(r.uniform(0.06, 0.2), r.uniform(0.04, 0.06)))[rng.integers(3)](rng)
+    shape = (_l_shape, _round, lambda r: _oblong(r.uniform(0.06, 0.2), r.uniform(0.04, 0.06)))[rng.integers(3)](rng)
     return _at_rest(rng, "vertical", [(shape, rng.uniform(0.005, 0.02))], rest=False)
 
 
@@ -273,7 +273,7 @@ TASKS: dict[str, Callable[[np.random.Generator], Task]] = {
 """What makes a task of each kind from a generator of random numbers."""
 
 
-def rectangle(length: float, width: float) -> np.ndarray:
+def _oblong(length: float, width: float) -> np.ndarray:
     """The corners [4, 2] (m) of a rectangle."""
     return np.array([[0, 0], [length, 0], [length, width], [0, width]])
 
