@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 
 from jaxsand.goals.goal import Goal
-from jaxsand.goals.surfaces import rough_surface
-from jaxsand.interaction.outcome import check
+from jaxsand.goals.surfaces import places, rested, rough_surface
 from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Actions, Flat, Rising
 from jaxsand.planning.stroke_loss import GRADIENT
-from jaxsand.relaxation.settling import settle
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -60,9 +58,7 @@ def ramp(name: str, level: float, depth: float, trial: dict[str, float]) -> Work
 def pad() -> Work:
     """A level square of the ramp's size in rough ground of 40 mm relief, at the ground's mean height there."""
     _, inside = _ground()
-    rough = settle(_scene(), rough_surface(np.random.default_rng(5), _SHAPE, 0.04, 1.0).astype(np.float32))
-    check(rough)
-    height = np.asarray(rough.height)
+    height = rested(_scene(), rough_surface(np.random.default_rng(5), _SHAPE, 0.04, 1.0))
     level = float(height[inside].mean())
     return Work("pad", _scene(), height, np.where(inside, level, np.nan), -level, {})
 
@@ -158,5 +154,5 @@ def _scene() -> Scene:
 
 def _ground() -> tuple[np.ndarray, np.ndarray]:
     """Where cells lie along x (m), and which of them are shaped: both [H, W]."""
-    x, y = np.meshgrid((np.arange(_SHAPE[1]) + 0.5) * _SPACING, (np.arange(_SHAPE[0]) + 0.5) * _SPACING)
+    x, y = places(_SHAPE, _SPACING)
     return x, (x > _START) & (x < _END) & (y > _SIDES[0]) & (y < _SIDES[1])

@@ -1,4 +1,4 @@
-"""Surfaces of sand to start from: rough ones, and real terrain. They are not at rest yet; settle them."""
+"""Surfaces of sand to start from: rough ones, and real terrain, which are not at rest before they are `rested`."""
 
 from typing import Any
 
@@ -6,6 +6,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from jaxsand.goals import metrics
+from jaxsand.interaction.outcome import check
+from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.scene.scene import Scene
 
 
 def rough_surface(rng: np.random.Generator, shape: tuple[int, ...], relief: float, scale: float) -> np.ndarray:
@@ -39,3 +43,20 @@ def terrain_surface(shape: tuple[int, int], relief: float) -> np.ndarray:
     """The terrain at another shape, around height 0, `relief` (m) from its lowest to its highest point."""
     land = metrics.resample(terrain(), shape)
     return (land - np.median(land)) / (land.max() - land.min()) * relief
+
+
+def rested(scene: Scene, surface: np.ndarray) -> np.ndarray:
+    """A surface [H, W] (m) after it has settled, in float32.
+
+    Raises:
+      OutcomeError: if the sand does not come to rest.
+    """
+    settled = settle(scene, surface.astype(np.float32), stop=UntilStill(bound=200_000))
+    check(settled)
+    return np.asarray(settled.height)
+
+
+def places(shape: tuple[int, int], spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the cells of a map lie: their x and their y, each [H, W] (m)."""
+    x, y = np.meshgrid((np.arange(shape[1]) + 0.5) * spacing, (np.arange(shape[0]) + 0.5) * spacing)
+    return x, y

@@ -13,10 +13,8 @@ import numpy as np
 
 from jaxsand.goals.goal import Goal
 from jaxsand.goals.metrics import iou
-from jaxsand.goals.surfaces import rough_surface, terrain_surface
-from jaxsand.interaction.outcome import check
-from jaxsand.relaxation.settling import settle
-from jaxsand.relaxation.stopping import UntilStill, check_whole
+from jaxsand.goals.surfaces import places, rested, rough_surface, terrain_surface
+from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 
@@ -124,7 +122,7 @@ def figures(task: Task, height: Map) -> dict[str, float | None]:
 def _level(rng: np.random.Generator) -> Task:
     """Rough ground of 20 mm relief, to be levelled everywhere."""
     scene = _scene((32, 32), 0.01, Blade(width=0.08, thickness=0.02, depth=0.0))
-    start = _rested(scene, rough_surface(rng, scene.grid.shape, 0.02, 1.6))
+    start = rested(scene, rough_surface(rng, scene.grid.shape, 0.02, 1.6))
     everywhere = np.ones(scene.grid.shape, bool)
     return Task("level", scene, start, Goal(np.full(scene.grid.shape, start.mean())), everywhere, 24)
 
@@ -132,7 +130,7 @@ def _level(rng: np.random.Generator) -> Task:
 def _pad(rng: np.random.Generator) -> Task:
     """A level place of 0.28 x 0.16 m in rough ground of 40 mm relief, at the ground's mean height there."""
     scene = _scene((16, 32), 0.02, Blade(width=0.1, thickness=0.03, depth=0.0))
-    start = _rested(scene, rough_surface(rng, scene.grid.shape, 0.04, 1.0))
+    start = rested(scene, rough_surface(rng, scene.grid.shape, 0.04, 1.0))
     x, y = _places(scene)
     cells = (abs(x - 0.32) < 0.15) & (abs(y - 0.16) < 0.08)
     return _where(scene, "pad", start, np.full(start.shape, start[cells].mean()), cells, 24)
@@ -171,7 +169,7 @@ def _pit_and_heap(rng: np.random.Generator) -> Task:
     radius, depth = rng.uniform(0.035, 0.05), rng.uniform(0.01, 0.02)
     pit, heap = (np.hypot(along - side * 0.07, across) < radius for side in (-1, 1))
     shape = np.where(pit, -depth, 0) + np.where(heap, depth * pit.sum() / max(heap.sum(), 1), 0)
-    wanted = _rested(scene, shape)
+    wanted = rested(scene, shape)
     cells = abs(wanted) > 1e-4
     return Task("pit-and-heap", scene, _flat(scene), Goal(wanted), cells, 12)
 
@@ -191,14 +189,14 @@ def _spread(rng: np.random.Generator) -> Task:
     x, y = _places(scene)
     centre, radius = rng.uniform(0.1, 0.22, 2), rng.uniform(0.05, 0.07)
     heap = rng.uniform(0.02, 0.03) * (np.hypot(x - centre[0], y - centre[1]) < radius)
-    start = _rested(scene, heap)
+    start = rested(scene, heap)
     return Task("spread", scene, start, Goal(np.full(start.shape, start.mean())), np.ones(start.shape, bool), 24)
 
 
 def _profile(rng: np.random.Generator) -> Task:
     """Rough ground to be cut and filled to waves along a road 0.16 m wide."""
     scene = _scene((16, 32), 0.02, Blade(width=0.1, thickness=0.03, depth=0.0))
-    start = _rested(scene, rough_surface(rng, scene.grid.shape, 0.02, 1.5))
+    start = rested(scene, rough_surface(rng, scene.grid.shape, 0.02, 1.5))
     x, y = _places(scene)
     wave = 0.015 * np.sin(2 * math.pi * (x / rng.uniform(0.3, 0.5) + rng.random()))
     cells = (abs(x - 0.32) < 0.25) & (abs(y - 0.16) < 0.08)
@@ -211,7 +209,7 @@ def _foundation(rng: np.random.Generator) -> Task:
     x, y = _places(scene)
     long, wide = rng.uniform(0.1, 0.13), rng.uniform(0.07, 0.1)
     outside = np.maximum(abs(x - 0.2) - long, abs(y - 0.2) - wide)
-    wanted = _rested(scene, np.where(abs(outside) < 0.012, -rng.uniform(0.008, 0.012), 0))
+    wanted = rested(scene, np.where(abs(outside) < 0.012, -rng.uniform(0.008, 0.012), 0))
     cells = abs(wanted) > 1e-4
     return Task("foundation", scene, _flat(scene), Goal(wanted, above=(cells | (outside < 0)) * 1.0), cells, 16)
 
@@ -222,7 +220,7 @@ def _relief(rng: np.random.Generator) -> Task:
     land = terrain_surface((128, 128), 1.0)
     row, column = rng.integers(0, 64, 2)
     patch = land[row : row + 64, column : column + 64]
-    wanted = _rested(scene, 0.02 * (patch - patch.min()) / np.ptp(patch))
+    wanted = rested(scene, 0.02 * (patch - patch.min()) / np.ptp(patch))
     return Task("relief", scene, _flat(scene), Goal(wanted - wanted.mean()), np.ones(wanted.shape, bool), 100)
 
 
@@ -296,17 +294,17 @@ def _at_rest(rng: np.random.Generator, name: str, steps: list[tuple[np.ndarray, 
     outline = steps[0][0]
     room = np.array([0.6, 0.3]) - 0.06 - np.ptp(outline, axis=0)
     move = 0.03 - outline.min(0) + rng.random(2) * np.maximum(room, 0)
-    places = np.stack([x.ravel() for x in _places(scene)], 1)
+    spots = np.stack([x.ravel() for x in _places(scene)], 1)
     shape = _flat(scene).astype(float)
     for corners, depth in steps:
-        shape[_within(corners + move, places).reshape(shape.shape)] = -depth
+        shape[_within(corners + move, spots).reshape(shape.shape)] = -depth
     return _dig(scene, name, shape, 24, rest)
 
 
-def _within(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Which places [n, 2] lie within a polygon of corners [m, 2]: rays from them cross its sides an odd number of times."""
+def _within(corners: np.ndarray, spots: np.ndarray) -> np.ndarray:
+    """Which spots [n, 2] lie within a polygon of corners [m, 2]: rays from them cross its sides an odd number of times."""
     (x0, y0), (x1, y1) = corners.T[:, :, None], np.roll(corners, -1, axis=0).T[:, :, None]
-    x, y = places.T[:, None]
+    x, y = spots.T[:, None]
     crosses = (y0 > y) != (y1 > y)
     at = x0 + (y - y0) * (x1 - x0) / np.where(crosses, y1 - y0, 1)
     return (crosses & (x < at)).sum(0) % 2 == 1
@@ -314,7 +312,7 @@ def _within(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 def _dig(scene: Scene, name: str, shape: Map, strokes: int, rest: bool = True) -> Task:
     """Level sand from which a shape is to be dug; elsewhere heaps may lie, but no holes."""
-    wanted = _rested(scene, shape) if rest else shape.astype(np.float32)
+    wanted = rested(scene, shape) if rest else shape.astype(np.float32)
     cells = wanted < -1e-4
     return Task(name, scene, _flat(scene), Goal(wanted, above=cells * 1.0), cells, strokes)
 
@@ -332,18 +330,9 @@ def _flat(scene: Scene) -> Map:
     return np.zeros(scene.grid.shape, np.float32)
 
 
-def _rested(scene: Scene, surface: Map) -> Map:
-    settled = settle(scene, surface.astype(np.float32), stop=UntilStill(bound=200_000))
-    check(settled)
-    return np.asarray(settled.height)
-
-
 def _places(scene: Scene) -> tuple[Map, Map]:
     """Where cells lie, x and y [H, W] (m)."""
-    rows, columns = scene.grid.shape
-    spacing = float(scene.grid.spacing)
-    x, y = np.meshgrid((np.arange(columns) + 0.5) * spacing, (np.arange(rows) + 0.5) * spacing)
-    return x, y
+    return places(scene.grid.shape, float(scene.grid.spacing))
 
 
 def _turned(scene: Scene, rng: np.random.Generator) -> tuple[Map, Map]:

@@ -7,12 +7,10 @@ from functools import cache
 import numpy as np
 
 from jaxsand.goals import metrics, surfaces
-from jaxsand.goals.surfaces import rough_surface
+from jaxsand.goals.surfaces import places, rested, rough_surface
 from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
-from jaxsand.interaction.outcome import check
 from jaxsand.planning.search.actions import Actions, Lattice, Steps
 from jaxsand.planning.search.rollouts import replay
-from jaxsand.relaxation.settling import settle
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade
 
@@ -71,8 +69,8 @@ def _frame() -> SandTask:
 def _ridge() -> SandTask:
     """A trench at the foot of a ridge that is to stay, with its sand on the far side only; no strokes reach that goal."""
     scene = _scene(Blade())
-    x, y = _places()
-    ridge = _at_rest(scene, 0.02 * ((np.abs(y - 0.19) < 0.015) & (np.abs(x - 0.16) < 0.11)))
+    x, y = places(SHAPE, SPACING)
+    ridge = rested(scene, 0.02 * ((np.abs(y - 0.19) < 0.015) & (np.abs(x - 0.16) < 0.11)))
     level = np.zeros(SHAPE, np.float32)
     trench = np.where(y < 0.145, replay(scene, level, [np.array([[0.06, 0.13], [0.26, 0.13]])]), 0)
     return SandTask("trench by a ridge", scene, ridge, ridge + trench - trench.mean(), 3, Lattice())
@@ -80,7 +78,7 @@ def _ridge() -> SandTask:
 
 def _pit() -> SandTask:
     """A heap beside a pit of the same size, to be levelled with a blade that scrapes at height 0."""
-    x, y = _places()
+    x, y = places(SHAPE, SPACING)
     pit = 0.03 * (np.hypot(x - 0.1, y - 0.16) < 0.04) - 0.03 * (np.hypot(x - 0.21, y - 0.16) < 0.04)
     return _levelling("pit from a heap", pit, 8)
 
@@ -131,20 +129,9 @@ def _drawn(name: str, strokes: list[list[float]]) -> SandTask:
 def _levelling(name: str, height: np.ndarray, strokes: int) -> SandTask:
     """A task to level a surface, with a blade 4 cm wide that scrapes at height 0."""
     scene = _scene(Blade(width=0.04, thickness=0.015, depth=0.0))
-    height = _at_rest(scene, height)
+    height = rested(scene, height)
     return SandTask(name, scene, height - height.mean(), np.zeros(SHAPE), strokes, Lattice())
 
 
 def _scene(blade: Blade) -> Scene:
     return usual_scene(tool=blade)
-
-
-def _at_rest(scene: Scene, height: np.ndarray) -> np.ndarray:
-    settled = settle(scene, height.astype(np.float32))
-    check(settled)
-    return np.asarray(settled.height)
-
-
-def _places() -> tuple[np.ndarray, np.ndarray]:
-    x, y = np.meshgrid((np.arange(SHAPE[1]) + 0.5) * SPACING, (np.arange(SHAPE[0]) + 0.5) * SPACING)
-    return x, y
