@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxsand.goals.goal import Goal
 from jaxsand.goals.metrics import iou
+from jaxsand.goals.outlines import inside
 from jaxsand.goals.surfaces import places, rested, rough_surface, terrain_surface
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene
@@ -294,20 +295,10 @@ def _at_rest(rng: np.random.Generator, name: str, steps: list[tuple[np.ndarray, 
     outline = steps[0][0]
     room = np.array([0.6, 0.3]) - 0.06 - np.ptp(outline, axis=0)
     move = 0.03 - outline.min(0) + rng.random(2) * np.maximum(room, 0)
-    spots = np.stack([x.ravel() for x in _places(scene)], 1)
     shape = _flat(scene).astype(float)
     for corners, depth in steps:
-        shape[_within(corners + move, spots).reshape(shape.shape)] = -depth
+        shape[inside(corners + move, scene.grid)] = -depth
     return _dig(scene, name, shape, 24, rest)
-
-
-def _within(corners: np.ndarray, spots: np.ndarray) -> np.ndarray:
-    """Which spots [n, 2] lie within a polygon of corners [m, 2]: rays from them cross its sides an odd number of times."""
-    (x0, y0), (x1, y1) = corners.T[:, :, None], np.roll(corners, -1, axis=0).T[:, :, None]
-    x, y = spots.T[:, None]
-    crosses = (y0 > y) != (y1 > y)
-    at = x0 + (y - y0) * (x1 - x0) / np.where(crosses, y1 - y0, 1)
-    return (crosses & (x < at)).sum(0) % 2 == 1
 
 
 def _dig(scene: Scene, name: str, shape: Map, strokes: int, rest: bool = True) -> Task:
