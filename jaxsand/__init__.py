@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxsand.envs import make as make
+    from jaxsand.goals.drawing import read_drawing as read_drawing
     from jaxsand.goals.goal import Goal as Goal
     from jaxsand.interaction._path import Pushed as Pushed
     from jaxsand.interaction.batched import step_batch as step_batch
@@ -162,6 +163,7 @@ _HOMES = {
     "optimise_strokes": "planning.gradient",
     "plan": "planning.binary",
     "plan_sand": "planning.search",
+    "read_drawing": "goals.drawing",
     "remove": "interaction.pouring",
     "rollout": "interaction.simulate",
     "scoop": "interaction.bucket",

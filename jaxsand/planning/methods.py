@@ -22,7 +22,7 @@ def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: in
     """
     start = at_rest(target.scene, before, tell)
     tell(f"searching {strokes} strokes in {pushes} pushes")
-    found = plan_sand(target.scene, start, target.goal, strokes=strokes, budget=pushes, seed=seed)
+    found = plan_sand(target.scene, start, target.wanted, strokes=strokes, budget=pushes, seed=seed)
     return _by("search", target, found, found.paths)
 
 
@@ -30,13 +30,13 @@ def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pu
     """The target with `strokes` strokes (None: as many as pay) from gradients, which cost at most `pushes` pushes."""
     start = at_rest(target.scene, before, tell)
     tell("sketching")
-    found = optimise_strokes(target.scene, target.goal, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)
+    found = optimise_strokes(target.scene, target.wanted, strokes=strokes, key=seed, start=start, budget=pushes, tell=tell)
     return _by("optimise", target, found, found.strokes.reshape(-1, 2, 2))
 
 
 def by_policy(target: Target, before: np.ndarray | None, strokes: int, stages: Stages, tell: Tell) -> Target:
     """The target with at most `strokes` strokes of the policy, improved by the stages that follow it."""
-    sand = sand_loss(target.scene, at_rest(target.scene, before, tell), target.goal.astype(np.float32))
+    sand = sand_loss(target.scene, at_rest(target.scene, before, tell), target.wanted)
     found = plan_by_policy(load_policy(), sand, strokes, stages, tell)
     return _by("policy", target, found, found.strokes.reshape(-1, 2, 2))
 

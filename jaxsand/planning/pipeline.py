@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.goals import metrics
-from jaxsand.goals.goal import as_goal
+from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import Shaped, follow_frames
 from jaxsand.interaction.stepped import SteppedPush
@@ -31,7 +31,7 @@ from jaxsand.scene.window import Whole
 _PARTS = 6  # of a single stroke, in its recording
 _KEPT = 2**28  # bytes of a recording's maps: more legs than that are recorded less often
 
-Kind = Literal["map", "glyph", "image", "heights", "terrain"]
+Kind = Literal["map", "glyph", "image", "heights", "drawing", "terrain"]
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,7 @@ class Target:
       optimal: whether the number of steps is proven to be the fewest; None where nothing was proven.
       lower_bound: no plan has fewer steps; None where nothing was proven.
       found: what a method that tries strokes on sand reported.
+      weighted: the goal with its weights, if some cell that is not free costs more or less than another.
     """
 
     name: str
@@ -91,6 +92,12 @@ class Target:
     optimal: bool | None = None  # whether the steps are proven fewest, and what is proven of them; plans only
     lower_bound: float | None = None
     found: SandPlan | Optimised | Planned | None = None  # what a search on real sand says of itself
+    weighted: Goal | None = None
+
+    @property
+    def wanted(self) -> Goal | np.ndarray:
+        """The goal as methods are to seek it: with its weights, if it has any."""
+        return self.goal if self.weighted is None else self.weighted
 
     @property
     def footprint(self) -> tuple[float, float]:
@@ -109,7 +116,8 @@ class ShapeResult:
       after: the map [H, W] (m) after all strokes.
       frames: maps [F, H, W] (m) on the way, for an animation.
       tools: [F, 4] x, y (m), cos and sin of the tool's heading in each frame; NaN while it is lifted.
-      figures: iou, l2_reduction, l2_reduction_with_berms, volume_error and max_slope_deg.
+      figures: iou, l2_reduction (by the goal's weights, if it has any), l2_reduction_with_berms (all cells alike),
+        volume_error and max_slope_deg.
       seconds: run times of `prepare`, `compile` and `run`.
     """
 
@@ -149,11 +157,16 @@ def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -
     return Target(name, "map", "plan", scene, goal, (path,), True, layout.depth, found.optimal, found.lower_bound)
 
 
-def height_goal(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
-    """A height map as a goal that has no strokes yet; cells that are NaN are free."""
-    scene = make_scene(goal.shape, layout.spacing, tool=layout.blade)
-    goal = np.asarray(as_goal(scene, goal).height)
-    return Target(name, kind, "plan", scene, goal, (), not np.any(goal > 0), layout.depth)
+def height_goal(goal: Goal | np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
+    """A height map, or a `Goal`, as a goal that has no strokes yet; cells that are NaN are free."""
+    shape = np.shape(goal.height if isinstance(goal, Goal) else goal)
+    scene = make_scene((shape[0], shape[1]), layout.spacing, tool=layout.blade)
+    wanted = as_goal(scene, goal)
+    height = np.asarray(wanted.height)
+    alike = wanted.power == 2 and all(np.array_equal(weight, ~wanted.free) for weight in (wanted.above, wanted.below))
+    return Target(
+        name, kind, "plan", scene, height, (), not np.any(height > 0), layout.depth, weighted=None if alike else wanted
+    )
 
 
 def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
@@ -276,10 +289,15 @@ def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str,
         seen = np.where(np.isnan(target.goal), before, after).astype(float)  # what is free has nothing to be gained
         return float(metrics.l2_reduction(goal, view(before.astype(float)), view(seen)))
 
-    whole = reduction(lambda h: h)
+    whole = alone = reduction(lambda h: h)
+    if target.drawn:
+        alone = reduction(lambda h: np.minimum(h, 0))
+    elif target.weighted is not None:
+        far, left = (float(target.weighted.distance(h.astype(float))) for h in (before, after))
+        alone = 1 - left / far if far else (-math.inf if left else 1.0)
     return {
         "iou": float(metrics.iou(target.goal, np.where(np.isnan(target.goal), np.nan, after), target.depth)),
-        "l2_reduction": reduction(lambda h: np.minimum(h, 0)) if target.drawn else whole,
+        "l2_reduction": alone,
         "l2_reduction_with_berms": whole,
         "volume_error": metrics.volume_error(before, after),
         "max_slope_deg": math.degrees(math.atan(float(steepest_slope(target.scene, after)))),
