@@ -76,9 +76,9 @@ def _shape(commands: Any) -> None:
     p.add_argument(
         "--depth-mm",
         type=number,
-        help="trench depth (3; 7.5 for .npy and terrain, or as deep as a .npy is by search, optimise and policy)",
+        help="trench depth (3; 7.5 for .npy, .json and terrain, or as deep as the goal is by search, optimise and policy)",
     )
-    p.add_argument("--spacing", type=number, help="grid spacing in m (0.01)")
+    p.add_argument("--spacing", type=number, help="grid spacing in m (0.01; a .json gives its own)")
     p.add_argument("--resolution", type=count, help="grid cells to a map cell (6)")
     p.add_argument("--cells", type=count, help="grid cells along the longer side of a .png or terrain (48)")
     p.add_argument("--first-row", choices=["bottom", "top"], help="where the first row of .npy files lies (bottom: y = 0)")
@@ -183,7 +183,7 @@ def _bench(commands: Any) -> None:
 
 _GOAL = (
     "a letter, a .txt map of # and . (first row on top), a .png (dark is dug; first row on top), a .npy height map in m "
-    "(first row at the bottom, y = 0; see --first-row), or terrain"
+    "(first row at the bottom, y = 0; see --first-row), a .json drawing, or terrain"
 )
 _NO_DATA = (
     "what .npy files hold where nothing is known (-9999, ...); a goal of search, optimise or policy is free in such cells, "

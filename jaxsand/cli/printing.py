@@ -28,5 +28,5 @@ def lines(report: dict[str, Any]) -> str:
 
 
 def plain_name(name: str) -> str:
-    stem = Path(name).stem if Path(name).suffix in (".txt", ".png", ".npy") else name
+    stem = Path(name).stem if Path(name).suffix in (".txt", ".png", ".npy", ".json") else name
     return "".join(c if c.isalnum() else "-" for c in stem)[:40]

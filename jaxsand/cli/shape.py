@@ -13,6 +13,7 @@ from jaxsand.cli.printing import plain_name, read_cell, show
 if TYPE_CHECKING:
     import numpy as np
 
+    from jaxsand.goals.goal import Goal
     from jaxsand.planning.gradient import Optimised
     from jaxsand.planning.learned.stages import Planned
     from jaxsand.planning.pipeline import Layout, ShapeResult, Target
@@ -86,7 +87,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
 
 
 _ROWS = "heights in metres, first row at y = 0; with --first-row top, on top as in pictures and maps"
-_OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".json", ".npz", ".svg", ".tif", ".tiff")
+_OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".npz", ".svg", ".tif", ".tiff")
 _REFINED = 4000  # pushes by --refine, unless told otherwise
 _DARK = 0.5  # of black: what a picture's free cells are darker than
 _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
@@ -182,11 +183,11 @@ def _target(options: argparse.Namespace) -> "Target":
     name, method = options.goal, options.method
     path = Path(name)
     suffix = path.suffix.lower()
-    is_file = suffix in (".txt", ".png", ".npy")
+    is_file = suffix in (".txt", ".png", ".npy", ".json")
     if not name.strip():
-        raise ValueError("goal: got an empty name; give a letter, a .txt, .png or .npy file, or terrain")
+        raise ValueError("goal: got an empty name; give a letter, a .txt, .png, .npy or .json file, or terrain")
     if suffix and not is_file and (suffix in _OTHER_FILES or path.is_file()):
-        raise ValueError(f"goal: got {name!r}, and {suffix} is not read; give a .txt, .png or .npy file ({_ROWS})")
+        raise ValueError(f"goal: got {name!r}, and {suffix} is not read; give a .txt, .png, .npy or .json file ({_ROWS})")
     if method == "strokes" and (is_file or name == "terrain"):
         raise ValueError(f"method: 'strokes' pushes a glyph's own strokes, {name} has none; use --method plan")
     if method != "plan" and not (is_file or name == "terrain"):
@@ -206,7 +207,7 @@ def _target(options: argparse.Namespace) -> "Target":
         dig, own = letters.letter_map(name.upper() if name.isascii() else name)
     else:
         raise ValueError(
-            f"goal: got {name!r}; give a letter A to Z, a .txt, .png or .npy file, or terrain, "
+            f"goal: got {name!r}; give a letter A to Z, a .txt, .png, .npy or .json file, or terrain, "
             "or push any text by its own strokes with --method strokes"
         )
     return pipeline.map_target(
@@ -215,7 +216,7 @@ def _target(options: argparse.Namespace) -> "Target":
 
 
 def _surface_target(options: argparse.Namespace) -> "Target":
-    """The goal that a picture, a height map or the terrain is; with strokes only where the method is to plan them."""
+    """The goal that a picture, heights, a drawing or the terrain is; with strokes only where the method is to plan them."""
     from jaxsand.goals import letters, surfaces
     from jaxsand.planning import pipeline
 
@@ -227,6 +228,8 @@ def _surface_target(options: argparse.Namespace) -> "Target":
         if not planned:
             raise _drawn(options)
         return pipeline.image_target(picture, path.stem, _layout(options), _cells(options))
+    if path.suffix.lower() == ".json":
+        return _drawing_target(path, options)
     if name == "terrain":
         layout = _layout(options, _DEEP)
         heights = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
@@ -235,6 +238,44 @@ def _surface_target(options: argparse.Namespace) -> "Target":
         layout = _layout(options, _DEEP if planned else _deep_enough(heights, options.method))
     make = pipeline.height_target if planned else pipeline.height_goal
     return make(heights, "terrain" if name == "terrain" else "heights", path.stem, layout)
+
+
+def _drawing_target(path: Path, options: argparse.Namespace) -> "Target":
+    """The goal that a drawing is, on the grid that it gives; with strokes only where the method is to plan them."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from jaxsand.goals.drawing import SHEET, as_drawing
+    from jaxsand.planning import pipeline
+    from jaxsand.scene.scene import make_scene
+
+    drawing = as_drawing(existing(path))
+    if drawing.grid is None:
+        raise ValueError(f"grid: is missing in {path}; give {SHEET.what}")
+    if options.spacing is not None:
+        raise ValueError(f"spacing: {path} gives its own; leave --spacing out")
+    goal = drawing.on(make_scene(drawing.grid.shape, drawing.grid.spacing))
+    planned = options.method == "plan"
+    depth = _DEEP if planned else _deep_enough(np.asarray(goal.height), options.method)
+    layout = replace(_layout(options, depth), spacing=drawing.grid.spacing)
+    if planned:
+        return pipeline.height_target(_planned(goal), "drawing", path.stem, layout)
+    return pipeline.height_goal(goal, "drawing", path.stem, layout)
+
+
+def _planned(goal: "Goal") -> "np.ndarray":
+    """A drawing's heights for the binary plan, which compares what is dug: it can tell neither weights nor free cells."""
+    import numpy as np
+
+    heights = np.asarray(goal.height)
+    heaps = (np.asarray(goal.above) == 0) & (heights >= 0)  # may lie where nothing is to be dug
+    if np.isnan(heights).any() or not np.all((np.asarray(goal.below) == 1) & ((np.asarray(goal.above) == 1) | heaps)):
+        raise ValueError(
+            "method: 'plan' knows no free cells, and no weights but that heaps may lie where nothing is to be dug; "
+            "use --method search or optimise"
+        )
+    return heights
 
 
 def _goal_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
@@ -304,7 +345,12 @@ def _dug_alone(target: "Target") -> str:
     """What else to do about a goal that only digs."""
     import numpy as np
 
-    digs = not (target.goal > 0).any() and not np.isnan(target.goal).any() and bool((target.goal < 0).any())
+    digs = (
+        target.weighted is None
+        and not (target.goal > 0).any()
+        and not np.isnan(target.goal).any()
+        and bool((target.goal < 0).any())
+    )
     return ", or use --method plan, which compares only what is dug" if digs else ""
 
 

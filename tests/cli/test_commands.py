@@ -15,6 +15,18 @@ from jaxsand.goals.metrics import volume_error
 from jaxsand.planning.search.rollouts import Effort
 
 L_MAP = "#..\n#..\n###\n"
+PIT = {"kind": "rectangle", "centre": [0.12, 0.12], "size": [0.12, 0.08], "height": -0.004}
+SHEET = {"shape": [12, 12], "spacing": 0.02}
+DRAWINGS = {
+    "pit": {"shapes": [PIT], "grid": SHEET, "outside": "heaps"},
+    "pad": {"shapes": [PIT], "grid": SHEET, "outside": "free"},
+    "strict": {"shapes": [PIT], "grid": SHEET, "outside": {"above": 5}},
+    "plain": {"shapes": [PIT], "grid": SHEET},
+    "gridless": {"shapes": [PIT]},
+    "corners": {"shapes": [PIT, {"kind": "polygon", "points": [[0, 0], [0.1, 0.1]], "height": 0}], "grid": SHEET},
+    "huge": {"shapes": [PIT], "grid": {"shape": [100000, 100000], "spacing": 0.01}},
+    "infinite": {"shapes": [{**PIT, "height": float("nan")}], "grid": SHEET},
+}
 
 
 @pytest.fixture
@@ -33,6 +45,9 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "broken.npy").write_bytes(b"rubbish")
     (tmp_path / "a-file").write_text("")
     (tmp_path / "land.xyz").write_text("0 0 0")
+    (tmp_path / "broken.json").write_text("{'shapes': ")
+    for name, drawing in DRAWINGS.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(drawing))
     np.save(tmp_path / "cube.npy", np.zeros((2, 2, 2)))
     np.save(tmp_path / "flat.npy", np.zeros((12, 12), np.float32))
     np.save(tmp_path / "dip.npy", np.full((12, 12), -0.01))
@@ -71,6 +86,21 @@ BAD = {
     "level heights": (["shape", "flat.npy"], "goal: .*nothing to dig"),
     "heights not finite": (["shape", "nan.npy"], "goal: got 144 cells that are not finite"),
     "too few heights": (["shape", "small.npy"], "goal: .*fewer than the 6"),
+    "missing drawing": (["shape", "none.json"], "none.json: no such file"),
+    "broken drawing": (["shape", "broken.json"], "broken.json: cannot be read as a drawing"),
+    "drawing of two corners": (["shape", "corners.json"], r"shapes\[1\]\.points: got 2 of them; give the corners"),
+    "drawing not finite": (["shape", "infinite.json", "--method", "search"], r"shapes\[0\]\.height: got nan; give metres"),
+    "drawing on a huge grid": (["shape", "huge.json"], r"grid\.shape\[0\]: got 100000; give"),
+    "drawing on no grid": (
+        ["shape", "gridless.json"],
+        r'grid: is missing in gridless.json; give {"shape": \[rows, columns\]',
+    ),
+    "drawing of two spacings": (["shape", "pit.json", "--spacing", "0.02"], "spacing: pit.json gives its own; leave"),
+    "drawing with no data": (["shape", "pit.json", "--no-data", "0"], r"no-data: has an effect on \.npy files only"),
+    "drawing with a start": (["shape", "pit.json", "--start", "1,1"], "start: pit.json is no map"),
+    "plan of a drawing that is free": (["shape", "pad.json"], "method: 'plan' knows no free cells, and no weights"),
+    "plan of a drawing with weights": (["shape", "strict.json"], "method: 'plan' knows no free cells, and no weights"),
+    "strokes of a drawing": (["shape", "pit.json", "--method", "strokes"], "method: 'strokes' pushes a glyph's own strokes"),
     "start off the letter": (["shape", "S", "--start", "0,0"], r"start: got \(0, 0\)"),
     "start of one number": (["shape", "S", "--start", "3"], "start: got '3'"),
     "start for a picture": (["shape", "white.png", "--start", "1,1"], "start: .*leave --start out"),
@@ -320,6 +350,55 @@ def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypa
     assert float(scene.tool.depth) == report["blade"]["depth"] == max(0, -goal.min())
     assert (report["method"], report["strokes"], report["l2_reduction"]) == (method, [], 0)
     assert report["l2_reduction"] == report["l2_reduction_with_berms"]
+
+
+@pytest.mark.parametrize("method", ["search", "optimise", "policy"])
+@pytest.mark.parametrize("name", ["pit", "pad", "plain"])
+def test_methods_get_a_drawing_with_its_weights(here, name, method):
+    from jaxsand.cli.parser import _parser
+    from jaxsand.cli.shape import _target
+    from jaxsand.goals.drawing import read_drawing
+
+    target = _target(_parser().parse_args(["shape", f"{name}.json", "--method", method]))
+    assert (target.kind, target.name) == ("drawing", name)
+    assert (target.scene.grid.shape, float(target.scene.grid.spacing)) == ((12, 12), 0.02)
+    assert float(target.scene.tool.depth) == 0.004
+    drawn = read_drawing(DRAWINGS[name], target.scene)
+    np.testing.assert_array_equal(target.goal, drawn.height)
+    assert (target.goal == -0.004).sum() == 6 * 4
+    if name == "pit":
+        np.testing.assert_array_equal(target.wanted.above, drawn.above)
+    else:
+        assert target.wanted is target.goal
+
+
+@pytest.mark.parametrize("name", ["pit", "plain"])
+def test_a_drawing_is_planned(here, name):
+    """Heaps may lie outside, as with every goal of the binary plan."""
+    from jaxsand.cli.parser import _parser
+    from jaxsand.cli.shape import _target
+
+    target = _target(_parser().parse_args(["shape", f"{name}.json", "--resolution", "3", "--depth-mm", "4"]))
+    assert (target.kind, target.method, target.drawn, target.weighted) == ("drawing", "plan", True, None)
+    assert len(target.paths) == 1
+    assert np.all(abs(target.paths[0] - 0.12) < [0.06, 0.04])
+
+
+def test_the_report_of_a_drawing(here, capsys, monkeypatch):
+    from jaxsand.planning import methods
+
+    def plan_sand(scene, start, goal, **options):
+        assert goal.free.sum() == 0
+        return methods.SandPlan((), start, 1.0, 1.0, 0.0, 0.0, Effort(), "too little; give more")
+
+    monkeypatch.setattr(methods, "plan_sand", plan_sand)
+    assert main(["shape", "pit.json", "--method", "search", "--json"]) == 0
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert err == "warning: strokes: too little; give more\n"
+    assert (report["goal"], report["goal_kind"], report["l2_reduction"]) == ("pit", "drawing", 0)
+    assert report["grid"] == SHEET
+    assert json.loads((here / "shape-pit" / "result.json").read_text()) == report
 
 
 @pytest.mark.slow
