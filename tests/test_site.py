@@ -74,6 +74,14 @@ def test_code_runs(path):
         assert float(abs(names["slope"]).max()) > 0
 
 
+def test_drawings_are_understood():
+    shown = [json.loads(code) for path in [README, *PAGES] for _, code in blocks(path, "json")]
+    for drawing in shown:
+        sheet = drawing["grid"]
+        assert jaxsand.read_drawing(drawing | {"repose": False}, jaxsand.make_scene(sheet["shape"], sheet["spacing"]))
+    assert shown
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", runnable(slow=True), ids=named)
 def test_slow_code_runs(path):

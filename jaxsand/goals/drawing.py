@@ -83,7 +83,7 @@ class Drawing:
                     f"shapes[{number}]: covers no cell's centre on a map of {_size(grid)} with cells of {grid.spacing:g} m; "
                     "move it onto the map, make it larger or the cells smaller, or leave it out"
                 )
-            height = np.where(cells, shape.over(height, grid), height)
+            height[cells] = shape.over(height, grid)[cells]
             above[cells], below[cells] = shape.weights
             drawn |= cells
         if self.repose:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.goals.surfaces import places
 from jaxsand.scene.grid import Grid
 
 _ROUNDING = 1e-9  # cells: what lies closer to an outline lies on it
@@ -30,15 +29,16 @@ def inside(corners: np.ndarray, grid: Grid) -> Cells:
         first, last = (_first(y, rows) for y in sorted((y0, y1)))
         if first < last:
             row = np.arange(first, last)
-            at = x0 + (row - y0) * ((x1 - x0) / (y1 - y0))
-            crossed[row, _first(at, columns)] += 1
+            share = np.clip((row - y0) / (y1 - y0), 0, 1)  # a row that lies on an end, up to rounding, may be just beyond it
+            crossed[row, _first(x0 + share * (x1 - x0), columns)] += 1
     return crossed.cumsum(1)[:, :columns] % 2 == 1
 
 
 def around(centre: tuple[float, float], inner: float, radius: float, grid: Grid) -> Cells:
     """The cells from `inner` up to, but not at, `radius` (m) from a centre (m)."""
-    x, y = places(grid.shape, float(grid.spacing))
-    distance = np.hypot(x - centre[0], y - centre[1]) + _ROUNDING * float(grid.spacing)
+    spacing = float(grid.spacing)
+    y, x = ((np.arange(n) + 0.5) * spacing for n in grid.shape)
+    distance = np.hypot(x - centre[0], y[:, None] - centre[1]) + _ROUNDING * spacing
     return (inner <= distance) & (distance < radius)
 
 
