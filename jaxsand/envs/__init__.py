@@ -11,11 +11,19 @@ from typing import Any, Literal, TypeVar, overload
 import jax
 import jax.numpy as jnp
 
-from jaxsand.envs.checks import check_heights, check_kinds, check_limit, check_ready_goals, check_scene, check_zones
+from jaxsand.envs.checks import (
+    check_heights,
+    check_kinds,
+    check_limit,
+    check_measure,
+    check_ready_goals,
+    check_scene,
+    check_zones,
+)
 from jaxsand.envs.digs import RandomDigs, dug
 from jaxsand.envs.excavate import Excavate, ExcavateParams, ExcavateState
 from jaxsand.envs.heights import Heights, OwnDepth
-from jaxsand.envs.library import Goals, Level, RandomStrokes, Rough, library
+from jaxsand.envs.library import Goals, Level, RandomStrokes, Rough, Starts, library
 from jaxsand.envs.maps import MapPool, Walks, map_pool, pool_of
 from jaxsand.envs.multi import (
     LevelGoals,
@@ -126,9 +134,11 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
       **options: for "single-stroke": `on`, `OnMap()` (a binary map, the default) or `OnSand()` (the simulator); `goals`, a
         `Walks()` or a `MapPool` (see `map_pool`, `pool_of`); `step_cost`; `limit`, steps after which an episode is
         truncated; and, with `OnSand()`, the `scene`. For "multi-stroke": the fields of `MultiStroke`; `goals`, a
-        `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, or maps [G, H, W] (m), such as
-        `jaxsand.task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no berms);
-        `starts`, a `Level()` or `Rough(relief)`; `seed`, for both; `scene`, by default 32 x 32 cells of 0.01 m with the
+        `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, a map [H, W] or maps [G, H, W] (m), such as
+        `jaxsand.task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no berms), with NaN
+        in free cells, or a `jaxsand.Goal` of such, whose weights are numbers, one map [H, W] or maps [G, H, W], and by whose
+        distance rewards are then measured; `starts`, a `Level()`, `Rough(relief)`, or sand at rest, a map [H, W] or one for
+        each goal [G, H, W] (m); `seed`, for both; `scene`, by default 32 x 32 cells of 0.01 m with the
         default blade, and a window of 12 x 12 cells that is computed around the blade while it is down; `limit`, strokes
         after which an episode is truncated; `zones`, where the blade may not be: `ClippedBy(cells)` or `RefusedBy(cells)`.
         For "excavate": the fields of `Excavate`, and `goals` (also a `RandomDigs()`, the default), `starts`, `seed`, `scene`
@@ -188,7 +198,7 @@ def _single(
 
 def _multi(
     goals: Goals | LevelGoals | RoughGoals | None = None,
-    starts: Level | Rough | None = None,
+    starts: Starts | None = None,
     scene: Scene | None = None,
     seed: int = 0,
     **options: Any,
@@ -209,12 +219,13 @@ def _multi(
     else:
         begin = Level() if starts is None else starts
         pool = library(env, scene, RandomStrokes() if goals is None else goals, begin, seed, zones)
+    check_measure(env, pool)
     return env, StrokeParams(scene, pool, **params)
 
 
 def _excavate(
     goals: RandomDigs | Goals | LevelGoals | RoughGoals | None = None,
-    starts: Level | Rough | None = None,
+    starts: Starts | None = None,
     scene: Scene | None = None,
     seed: int = 0,
     **options: Any,
@@ -239,6 +250,7 @@ def _excavate(
         blade = Blade(bucket.width, jnp.maximum(Blade().thickness, dx), bucket.depth)
         pusher = MultiStroke(env.push, batching=env.batching, settle=env.settle)
         pool = library(pusher, with_near(replace(scene, tool=blade)), goals, begin, seed, zones)
+    check_measure(env, pool)
     return env, ExcavateParams(scene, pool, **params)
 
 

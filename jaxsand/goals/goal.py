@@ -30,8 +30,8 @@ class Goal:
 
     Args:
         height: g [H, W] (m), with g[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx; or maps [B, H, W].
-        above: a, the weight of sand above the goal, 0 or more: a number or a map [H, W].
-        below: b, the weight of sand below the goal, 0 or more: a number or a map [H, W].
+        above: a, the weight of sand above the goal, 0 or more: a number or a map [H, W]; or maps [B, H, W].
+        below: b, the weight of sand below the goal, 0 or more: likewise.
         power: p, 2 or 1. Squares spread what is left evenly; with 1 the cost is a mean difference, and a few cells may be
             far off.
 
