@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxsand.envs import make as make
     from jaxsand.goals.drawing import read_drawing as read_drawing
+    from jaxsand.goals.feasible import AtBest as AtBest
+    from jaxsand.goals.feasible import at_best as at_best
     from jaxsand.goals.goal import Goal as Goal
     from jaxsand.interaction._path import Pushed as Pushed
     from jaxsand.interaction.batched import step_batch as step_batch
@@ -96,6 +98,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "AsNeeded": "scene.window",
+    "AtBest": "goals.feasible",
     "Base": "scene.boundaries",
     "Blade": "scene.tools",
     "Blurred": "planning.gradient",
@@ -150,6 +153,7 @@ _HOMES = {
     "Whole": "scene.window",
     "Window": "scene.window",
     "act": "interaction.simulate",
+    "at_best": "goals.feasible",
     "calibrate": "terramechanics.calibration",
     "calibrate_sections": "terramechanics.sections",
     "check": "interaction.outcome",

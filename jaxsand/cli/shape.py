@@ -73,7 +73,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
         "lifted": result.lifted,
         "steps": result.steps,
         **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
-        **({"search": _found(target.found) | {"reason": target.found.reason}} if target.found else {}),
+        **({"search": _found(target.found) | _at_best(result) | {"reason": target.found.reason}} if target.found else {}),
         **result.figures,
         "seconds": total,
         "seconds_plan": planned + seconds["prepare"],
@@ -156,6 +156,13 @@ def _found(found: "SandPlan | Optimised | Planned") -> dict[str, Any]:
     }
 
 
+def _at_best(result: "ShapeResult") -> dict[str, Any]:
+    """What l2 distance repose and volume leave at least, whatever the strokes (m)."""
+    from jaxsand.goals.feasible import at_best
+
+    return {"at_best": at_best(result.target.scene, result.before, result.target.goal).distance_bound}
+
+
 def _summary(report: dict[str, Any]) -> str:
     how = f"{report['steps']} strokes"
     if report["method"] == "plan":
@@ -168,12 +175,21 @@ def _summary(report: dict[str, Any]) -> str:
             f"{report['goal']} ({report['goal_kind']}): {how}",
             f"IoU {report['iou']:.3f}, l2 reduction {report['l2_reduction']:.3f} "
             f"(with berms {report['l2_reduction_with_berms']:.3f})",
+            *_distances(report.get("search")),
             f"volume error {report['volume_error']:.1e}, steepest slope {report['max_slope_deg']:.2f} deg",
             f"compile {report['seconds_compile']:.2f} s, run {report['seconds_run']:.2f} s, "
             f"plan {report['seconds_plan']:.2f} s, draw {report['seconds_draw']:.2f} s",
             *report["files"],
         )
     )
+
+
+def _distances(search: dict[str, Any] | None) -> list[str]:
+    """How near the strokes of a search come, and how near sand can come at best."""
+    if search is None:
+        return []
+    before, after, best = (1e3 * search[name] for name in ("before", "after", "at_best"))
+    return [f"l2 distance {before:.2f} mm before, {after:.2f} mm after; at best, by repose and volume alone, {best:.2f} mm"]
 
 
 def _target(options: argparse.Namespace) -> "Target":
