@@ -10,7 +10,8 @@ from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.goals.metrics import fits_where_it_counts
 from jaxsand.planning.search import rollouts
 from jaxsand.planning.search.actions import Job
-from jaxsand.planning.search.heights import around, propose_heights, search_heights, within
+from jaxsand.planning.search.heights import search_heights
+from jaxsand.planning.search.proposals import around, propose_heights, within
 from jaxsand.planning.search.reach import volume_distance
 from jaxsand.planning.search.rollouts import distance, replay
 from jaxsand.planning.stroke_loss import sand_loss
