@@ -5,6 +5,8 @@ are each the best of those tried on the sand that those before it left. The best
 a stroke will leave is foreseen (foresight.py), so that only the most promising of many are pushed.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from jaxsand.planning.search.actions import Job, Path
@@ -13,6 +15,7 @@ from jaxsand.planning.search.foresight import foreseen
 from jaxsand.planning.search.proposals import around, propose_heights
 from jaxsand.planning.search.rollouts import Effort, distance
 from jaxsand.planning.search.strokes import finish
+from jaxsand.scene.tools import Blade
 
 _SHARES = ((best_coverage, 0.1), (least_work, 0.15))  # of the budget at most
 _ONE_BY_ONE = 0.35  # of the budget is for strokes one after the other; the rest varies the best plan
@@ -33,6 +36,18 @@ def search_heights(job: Job, budget: float, rng: np.random.Generator) -> tuple[l
     effort += more
     plan, more = _varied(job, plan, budget - effort.cost, rng)
     return [stroke.reshape(2, 3) for stroke in plan], effort + more
+
+
+def with_the_best(job: Job, tools: tuple[Blade, ...], budget: float, rng: np.random.Generator) -> tuple[Job, Effort]:
+    """The job with the blade whose first plan, one stroke after another, leaves the sand closest to the goal."""
+    best, least, effort = job, np.inf, Effort()
+    for tool in tools:
+        with_it = replace(job, scene=replace(job.scene, tool=tool))
+        (_, left), more = one_by_one(with_it, budget / len(tools), rng)
+        effort += more
+        if left < least:
+            best, least = with_it, left
+    return best, effort
 
 
 def _varied(job: Job, plan: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[np.ndarray, Effort]:
