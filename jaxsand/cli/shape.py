@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 
 def run_shape(options: argparse.Namespace) -> None:
+    options.method = options.method or _suited(options.goal)
     _check_options(options)
     tell = progress()
     started = time.perf_counter()
@@ -32,11 +33,13 @@ def run_shape(options: argparse.Namespace) -> None:
     began = time.perf_counter()
     target = _target(options)
     surface = _surface(options, target)
-    strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
+    level = target.kind == "glyph" or options.method != "search"
+    strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6 if level else _STROKES)
     polish = _polish(options, strokes)
     out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
     if options.method == "search":
-        target = searched(target, surface, strokes, options.pushes or 1000 * strokes, options.seed or 0, tell)
+        pushes = options.pushes or (1000 * strokes if level else _PUSHES)
+        target = searched(target, surface, strokes, pushes, options.seed or 0, tell)
     if options.method == "optimise":
         target = optimised(target, surface, options.strokes, options.pushes or 4000, options.seed or 0, tell)
     if options.method == "policy":
@@ -70,6 +73,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
         "goal_kind": target.kind,
         "method": target.method,
         "strokes": [[round(v, 6) for v in stroke] for stroke in result.strokes],
+        "paths": [[[round(float(v), 6) for v in point] for point in path] for path in target.paths],
         "lifted": result.lifted,
         "steps": result.steps,
         **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
@@ -88,6 +92,7 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
 
 _ROWS = "heights in metres, first row at y = 0; with --first-row top, on top as in pictures and maps"
 _OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".npz", ".svg", ".tif", ".tiff")
+_STROKES, _PUSHES = 24, 2000  # of a search for strokes that rise and sink, unless told otherwise
 _REFINED = 4000  # pushes by --refine, unless told otherwise
 _DARK = 0.5  # of black: what a picture's free cells are darker than
 _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
@@ -100,6 +105,11 @@ _BY = {
     "refine": ("policy",),
     "free": ("search", "optimise", "policy"),
 }
+
+
+def _suited(goal: str) -> str:
+    """The method where none is told: the shortest stroke over a map, a search for a goal that has heights."""
+    return "search" if goal == "terrain" or Path(goal).suffix.lower() in (".png", ".npy", ".json") else "plan"
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -234,21 +244,26 @@ def _target(options: argparse.Namespace) -> "Target":
 def _surface_target(options: argparse.Namespace) -> "Target":
     """The goal that a picture, heights, a drawing or the terrain is; with strokes only where the method is to plan them."""
     from jaxsand.goals import letters, surfaces
+    from jaxsand.goals.goal import Goal
     from jaxsand.planning import pipeline
 
     name, path, planned = options.goal, Path(options.goal), options.method == "plan"
     if options.start:
         raise ValueError(f"start: {name} is no map of # and .; leave --start out")
     if path.suffix.lower() == ".png":
-        picture = letters.read_image(existing(path))
-        if not planned:
+        if options.method in ("optimise", "policy"):
             raise _drawn(options)
-        return pipeline.image_target(picture, path.stem, _layout(options), _cells(options))
+        layout = _layout(options)
+        heights = pipeline.image_goal(letters.read_image(existing(path)), layout, _cells(options))
+        if planned:
+            return pipeline.height_target(heights, "image", path.stem, layout)
+        return pipeline.height_goal(Goal(heights, above=(heights < 0) * 1.0), "image", path.stem, layout)
     if path.suffix.lower() == ".json":
         return _drawing_target(path, options)
     if name == "terrain":
         layout = _layout(options, _DEEP)
         heights = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
+        heights -= 0 if planned else heights.mean()  # what is dug is heaped
     else:
         heights = _goal_heights(path, options)
         layout = _layout(options, _DEEP if planned else _deep_enough(heights, options.method))
@@ -354,7 +369,10 @@ def _read_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
 
 
 def _drawn(options: argparse.Namespace) -> ValueError:
-    return ValueError(f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method plan")
+    other = "plan or search" if Path(options.goal).suffix.lower() == ".png" else "plan"
+    return ValueError(
+        f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method {other}"
+    )
 
 
 def _dug_alone(target: "Target") -> str:

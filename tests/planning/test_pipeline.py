@@ -71,7 +71,8 @@ def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
     picture = np.zeros((20, 40))
     picture[4:16, 4:10] = -1
     picture[4:16, 28:34] = -1
-    result = shape(pipeline.image_target(picture, "two", pipeline.Layout(margin=6), 48))
+    layout = pipeline.Layout(margin=6)
+    result = shape(pipeline.height_target(pipeline.image_goal(picture, layout, 48), "image", "two", layout))
     assert result.lifted
     assert len(result.target.paths) == 2
     assert result.figures["iou"] > 0.5
