@@ -7,7 +7,10 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def existing(path: Path, accepted: str = "") -> Path:
@@ -22,6 +25,20 @@ def existing(path: Path, accepted: str = "") -> Path:
     if not path.is_file():
         raise ValueError(f"{path}: no such file; check the name")
     return path
+
+
+def plausible(heights: "np.ndarray", most: float, file: str, middle: float = 0.0) -> None:
+    """Raises ValueError where a height lies further from the middle than `most` (m), as a value for no data does."""
+    import numpy as np
+
+    off = np.abs(np.where(np.isfinite(heights), heights, middle).astype(float) - middle)
+    if bad := int((off > most).sum()):
+        value = f"{float(heights.ravel()[np.argmax(off)]):.6g}"
+        raise ValueError(
+            f"{file}: got {bad} cells more than {most:.4g} m above or below {f'{middle:.4g} m' if middle else 'level sand'}, "
+            f"such as {value}, too much for a map of this size; where that stands for no data, give --no-data {value}, "
+            "and heights are in metres"
+        )
 
 
 def read_text(path: Path) -> str:
