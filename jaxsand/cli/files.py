@@ -33,10 +33,10 @@ def plausible(heights: "np.ndarray", most: float, file: str, middle: float = 0.0
 
     off = np.abs(np.where(np.isfinite(heights), heights, middle).astype(float) - middle)
     if bad := int((off > most).sum()):
-        value = f"{float(heights.ravel()[np.argmax(off)]):.6g}"
+        value, where = f"{float(heights.ravel()[np.argmax(off)]):.6g}", f"{middle:.4g} m" if middle else "level sand"
         raise ValueError(
-            f"{file}: got {bad} cells more than {most:.4g} m above or below {f'{middle:.4g} m' if middle else 'level sand'}, "
-            f"such as {value}, too much for a map of this size; where that stands for no data, give --no-data {value}, "
+            f"{file}: got {bad} cells more than {most:.4g} m above or below {where}, such as {value}, "
+            f"too much for a map of this size; where that stands for no data, give --no-data {value}, "
             "and heights are in metres"
         )
 

@@ -77,10 +77,25 @@ def remove(
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Settled:
-    """Takes sand away and lets the rest settle: the opposite of `deposit`, with the same arguments.
+    """Takes sand away and lets the rest settle: the opposite of `deposit`.
 
-    A volume V lowers cell [i, j] by V w[i, j] / (dx^2 sum w). On a floor (`Base`) a cell gives no more than lies on it, and
-    the others give the rest in the same proportions; where that is not enough, the outcome says NOT_POURED.
+    A volume V lowers cell [i, j] by V w[i, j] / (dx^2 sum w), with the weights w of `deposit`. On a floor (`Base`) a cell
+    gives no more than lies on it, and the others give the rest in the same proportions. Differentiable as `deposit` is.
+
+    Args:
+        scene: the scene; its tool does not matter.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        where: a point [2] = x, y (m), or a footprint: weights [H, W] of 0 or more, such as the share of each cell.
+        volume: how much sand (m^3), 0 or more.
+        scheme: scheme of settling, as of `settle`.
+        stop: stop rule of settling, as of `settle`.
+
+    Returns:
+        The settled map, and how settling went. The outcome says NOT_POURED where there is less sand than `volume`: all that
+        there is is taken then. It says so too where all weights are 0, and the map is then as if no sand had gone.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range.
 
     Example:
         >>> import jax.numpy as jnp
@@ -205,7 +220,7 @@ def poured(
     more = jnp.trunc(lax.stop_gradient(share) * rest())
     put, account = put + more, counted(account, more)
     left = rest()
-    number = jnp.cumsum((share > 0).ravel()).reshape(share.shape)
+    number = jnp.cumsum((share > 0).ravel().astype(share.dtype)).reshape(share.shape)
     more = jnp.where((share > 0) & (number <= jnp.abs(left)), jnp.sign(left), 0)
     put, account = put + more, counted(account, more)
     last = rest()
