@@ -1,7 +1,12 @@
 """The house's own rules: what may be imported where, and what its public names say."""
 
 import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 import jaxsand
 
@@ -55,8 +60,36 @@ def test_what_type_checkers_see_is_what_is_there():
     tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
     block = next(node for node in tree.body if isinstance(node, ast.If))
     seen = {a.asname: f"{node.module}" for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
-    assert seen == {name: f"jaxsand.{home}" for name, home in jaxsand._HOMES.items()}
+    modules = {name for name, home in seen.items() if home == "jaxsand"}
+    assert sorted(modules) == sorted(jaxsand._OTHER_NAMES)
+    homes = {name: f"jaxsand.{home}" for name, home in jaxsand._HOMES.items()}
+    assert seen == homes | dict.fromkeys(modules, "jaxsand")
+    assert not any(isinstance(node, ast.FunctionDef) and node.name == "__getattr__" for node in tree.body)
     assert jaxsand.__version__[0].isdigit()
+
+
+@pytest.mark.slow
+def test_misspelt_names_do_not_pass_type_checkers(tmp_path):
+    pytest.importorskip("mypy")
+    (tmp_path / "user.py").write_text(
+        "import jaxsand as js\nreveal_type(js.step)\nreveal_type(js.task.iou)\njs.stpe\njs.task.iuo\njs.settle(0)\n"
+    )
+    command = [sys.executable, "-m", "mypy", "--config-file=", "--ignore-missing-imports", "--follow-imports=silent"]
+    environment = os.environ | {"MYPYPATH": str(PACKAGE.parent)}
+    done = subprocess.run(
+        [*command, f"--cache-dir={tmp_path / 'cache'}", "user.py"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    told = {int(line.split(":")[1]): line for line in done.stdout.splitlines() if line.startswith("user.py:")}
+    assert "def (scene: jaxsand.scene.scene.Scene" in told[2]
+    assert 'Revealed type is "def (' in told[3]
+    assert 'has no attribute "stpe"' in told[4]
+    assert 'has no attribute "iuo"' in told[5]
+    assert 'expected "Scene"' in told[6]
 
 
 def test_no_module_hides_a_public_function():
