@@ -4,13 +4,15 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
+
+    from jaxsand.scene.progress import Tell
 
 
 def existing(path: Path, accepted: str = "") -> Path:
@@ -73,7 +75,7 @@ def written(path: Path) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
-def progress() -> Callable[[str], None]:
+def progress() -> "Tell":
     """Tells what goes on, on a terminal's one line; silent when piped."""
     if not sys.stderr.isatty():
         return lambda _: None

@@ -17,7 +17,7 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Around, flows
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, stored
+from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, stored, total
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 
@@ -134,12 +134,12 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
             bed, [flow.rate * g / length * t for g, length, t in zip(gates, lengths, tilt, strict=True)]
         )
     else:
-        drop = flow.rate * flux_adjoint.total(tilt[0])
+        drop = flow.rate * total(tilt[0])
     return Pulled(
         gain,
         -flow.rate * at(flux_adjoint.to_less_open(bed, around.open, per_length)),
         moved / (1 + around.stretch),
         -flux_adjoint.to_shape(lift * around.stretch, around.bottom),
-        -flux_adjoint.total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
+        -total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
         drop,
     )

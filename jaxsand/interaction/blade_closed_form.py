@@ -34,7 +34,7 @@ from jaxsand.interaction._overflow import Rim, nothing_beyond
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._shade import on_line, within_reach
 from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
-from jaxsand.relaxation.ghost_cells import Lost, lose
+from jaxsand.relaxation.ghost_cells import Lost, lose, total
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene, deep
@@ -222,7 +222,7 @@ def _sweep_out(  # noqa: PLR0915
     room = rooms[:2] + rooms[2:] + beyond
     density = (left_there / jnp.where(flanks > 0, 2 * flanks, 1))[None] * open_ / jnp.where(room > 0, room, 1)
     put = of_slices(at, left, density * (dx / thick)) * (outside + inside)
-    wanted, there = jnp.sum(density * (room - beyond)), jnp.sum(jnp.sum(put, axis=0))
+    wanted, there = jnp.sum(density * (room - beyond)), total(put)
     scale = wanted / jnp.where(wanted > 0, jnp.maximum(there, wanted / 2), 1)
     heap, kept, gone = _heap(job, pose, end, heaped, h, seen, open_ @ there_end, width, mu, rim)
     put, kept = put * scale + ring + heap, kept + jnp.maximum(wanted - 2 * there, 0)

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import heading
-from jaxsand.relaxation.ghost_cells import Bed, counted, largest, mark, prepare, quantum, truncate, unmark
+from jaxsand.relaxation.ghost_cells import Bed, counted, largest, mark, prepare, quantum, total, truncate, unmark
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
@@ -169,11 +169,11 @@ def _on_floor(bed: Bed, height: jax.Array, weights: jax.Array, amount: jax.Array
     spare = 4 * quantum(2 * (largest(height) + most))  # so that rounding takes no cell below its floor
     thick = jnp.where((thick > spare) & (weights > 0), thick - spare, 0)
     weights = weights / jnp.where(jnp.max(weights) > 0, jnp.max(weights), 1)
-    most = jnp.sum(jnp.sum(thick, axis=0))
+    most = total(thick)
 
     def scale(empty: jax.Array) -> jax.Array:
-        left = amount - jnp.sum(jnp.sum(jnp.where(empty, thick, 0), axis=0))
-        share = jnp.sum(jnp.sum(jnp.where(empty, 0, weights), axis=0))
+        left = amount - total(jnp.where(empty, thick, 0))
+        share = total(jnp.where(empty, 0, weights))
         return jnp.where(share > 0, jnp.maximum(left, 0) / jnp.where(share > 0, share, 1), jnp.inf)
 
     def once(_: jax.Array, empty: jax.Array) -> jax.Array:
@@ -200,7 +200,7 @@ def poured(
     weights = jnp.where(sound & ~jnp.isnan(marked), jnp.maximum(weights, 0), 0)
     most = jnp.max(weights)
     weights = weights / jnp.where(most > 0, most, 1)
-    whole = jnp.sum(jnp.sum(weights, axis=0), axis=0)
+    whole = total(weights)
     asked, there = jnp.where(sound, amount, 0), jnp.where(sound, there, 0)
     given = jnp.where(whole > 0, jnp.minimum(asked, there), 0)
     share = weights / jnp.where(whole > 0, whole, 1)

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxsand.goals import metrics
 from jaxsand.goals.goal import Goal, as_goal
+from jaxsand.goals.surfaces import rested
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import Shaped, follow_frames
 from jaxsand.interaction.stepped import SteppedPush
@@ -21,8 +22,7 @@ from jaxsand.planning.binary import Cell, connected_pieces, plan
 from jaxsand.planning.gradient import Optimised
 from jaxsand.planning.learned.stages import Planned
 from jaxsand.planning.search import SandPlan
-from jaxsand.relaxation.settling import settle, steepest_slope
-from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -293,9 +293,7 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
         return np.zeros(scene.grid.shape, np.float32)
     metrics.fits(scene, before, "surface")
     tell("settling the surface")
-    rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
-    check(rested)
-    return np.asarray(rested.height)
+    return rested(scene, np.asarray(before))
 
 
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsand.relaxation.ghost_cells import Bed, halo
+from jaxsand.relaxation.ghost_cells import Bed, halo, total
 from jaxsand.scene.grid import links
 
 Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
@@ -121,11 +121,6 @@ def to_less_open(bed: Bed, gate: Ghosted, parts: list[OnLattice]) -> Ghosted:
         less = here <= there
         net = net + _around(jnp.where(less, part, 0))[3 - first] + _around(jnp.where(less, 0, part))[3 - second]
     return halo(jnp.asarray(net), 0.0)
-
-
-def total(x: Float[Array, "H W"]) -> Float[Array, ""]:
-    """The sum of a map; the rows come first because XLA vectorises that."""
-    return jnp.sum(jnp.sum(x, axis=0))
 
 
 def to_shape(cotangent: jax.Array, like: jax.Array) -> jax.Array:

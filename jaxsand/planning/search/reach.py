@@ -24,6 +24,7 @@ import numpy as np
 
 from jaxsand.goals.goal import Goal, Power
 from jaxsand.scene.boundaries import Closed
+from jaxsand.scene.grid import places
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, square
 
@@ -89,13 +90,13 @@ def most_lowered(scene: Scene, height: np.ndarray, longest: float) -> float:
     long, wide = (longest + thickness + dx) / 2, (width + dx) / 2  # the blade's share of a cell fades over a spacing
     headings, pitch = 64, dx / 2
     delta = pitch / math.sqrt(2) + math.hypot(long, wide) * math.pi / (2 * headings)
-    x, y = (np.arange(columns) + 0.5) * dx, (np.arange(rows) + 0.5) * dx
+    x, y = places((rows, columns), dx)
     middles_x, middles_y = np.arange(0, columns * dx + pitch / 2, pitch), np.arange(0, rows * dx + pitch / 2, pitch)
     most = 0.0
     for heading in np.arange(headings) * math.pi / headings:
         cos, sin = math.cos(heading), math.sin(heading)
         for my in middles_y:
-            px, py = x - middles_x[:, None, None], (y - my)[:, None]
+            px, py = x[0] - middles_x[:, None, None], y[:, :1] - my
             beyond = np.maximum(np.abs(px * cos + py * sin) - long, 0)
             aside = np.maximum(np.abs(py * cos - px * sin) - wide, 0)
             rise = mu * np.maximum(np.sqrt(beyond**2 + aside**2) - delta, 0)
