@@ -1,9 +1,11 @@
 """The house's own rules: what may be imported where, and what its public names say."""
 
 import ast
+import inspect
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -90,6 +92,22 @@ def test_misspelt_names_do_not_pass_type_checkers(tmp_path):
     assert 'has no attribute "stpe"' in told[4]
     assert 'has no attribute "iuo"' in told[5]
     assert 'expected "Scene"' in told[6]
+
+
+def test_aliases_hold_what_they_say_and_no_more():
+    """Nothing that their homes import, such as numpy, is offered under the package's own names."""
+    for alias in ("env", "forces", "task", "tasks", "trench", *(["gym"] if find_spec("gymnasium") else [])):
+        module = getattr(jaxsand, alias)
+        scope = {}
+        exec(f"from jaxsand.{alias} import *", scope)
+        names = set(scope) - {"__builtins__"}
+        home = sys.modules["jaxsand.envs" if alias == "env" else "jaxsand.terramechanics.forces"]
+        assert names == set(getattr(module, "__all__", home.__all__)), alias
+        for name in names:
+            value = getattr(module, name)
+            assert not inspect.ismodule(value), f"{alias}.{name}"
+            assert getattr(value, "__module__", "jaxsand").startswith(("jaxsand", "builtins")), f"{alias}.{name}"
+        assert {name for name in vars(module) if not name.startswith("_")} == names, alias
 
 
 def test_no_module_hides_a_public_function():
