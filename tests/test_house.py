@@ -119,6 +119,21 @@ def test_public_functions_say_what_they_do():
         assert getattr(jaxsand, name).__doc__, name
 
 
+def without_docstrings(node, prefix=""):
+    """The functions in a module or class that bear no underscore, and say nothing of what they do."""
+    for part in node.body:
+        if isinstance(part, ast.ClassDef) and not part.name.startswith("_"):
+            yield from without_docstrings(part, f"{prefix}{part.name}.")
+        if isinstance(part, ast.FunctionDef) and not part.name.startswith("_") and not ast.get_docstring(part):
+            if not any("overload" in ast.unparse(decorator) for decorator in part.decorator_list):
+                yield prefix + part.name
+
+
+def test_every_function_that_others_call_says_what_it_does():
+    for path in [*PACKAGE.rglob("*.py"), *(PACKAGE.parent / "train").rglob("*.py")]:
+        assert not [*without_docstrings(ast.parse(path.read_text(encoding="utf-8")))], path
+
+
 def test_nothing_tells_to_run_the_learners_without_saying_where_they_are():
     """`pip install jaxsand` has no `train`: who is told to run it must be told that a checkout of the repository has it."""
     told = 0

@@ -44,6 +44,7 @@ def plausible(heights: "np.ndarray", most: float, file: str, middle: float = 0.0
 
 
 def read_text(path: Path) -> str:
+    """The text of a file."""
     try:
         return existing(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

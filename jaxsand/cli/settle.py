@@ -13,6 +13,7 @@ _TALLEST = 10  # times a map's side: what is higher or lower than that is no san
 
 
 def run_settle(options: argparse.Namespace) -> None:
+    """Runs `jaxsand settle`."""
     tell = progress()
     if options.out_file.suffix != ".npy":
         raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")

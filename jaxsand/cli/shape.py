@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 
 def run_shape(options: argparse.Namespace) -> None:
+    """Runs `jaxsand shape`."""
     _check_options(options)
     tell = progress()
     started = time.perf_counter()

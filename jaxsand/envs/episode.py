@@ -23,14 +23,16 @@ class HasTime(Protocol):
     """The state of an episode that counts its actions."""
 
     @property
-    def time(self) -> jax.Array: ...
+    def time(self) -> jax.Array:
+        """Actions so far."""
 
 
 class HasLimit(Protocol):
     """The parameters of an environment whose episodes are truncated after `limit` actions."""
 
     @property
-    def limit(self) -> jax.Array | int: ...
+    def limit(self) -> jax.Array | int:
+        """Actions after which an episode is truncated."""
 
 
 Timed = TypeVar("Timed", bound=HasTime)
@@ -44,20 +46,25 @@ class Environment(Protocol[Obs_co, State, Params_contra]):
     pure and work on one environment.
     """
 
-    def reset(self, key: jax.Array, params: Params_contra) -> tuple[Obs_co, State]: ...
+    def reset(self, key: jax.Array, params: Params_contra) -> tuple[Obs_co, State]:
+        """Begins an episode; returns its first observation and its state."""
 
-    def step_env(self, key: jax.Array, state: State, action: Action, params: Params_contra) -> Step[Obs_co, State]: ...
+    def step_env(self, key: jax.Array, state: State, action: Action, params: Params_contra) -> Step[Obs_co, State]:
+        """Takes one action, and does not begin a new episode after the last."""
 
 
 class Shapes(Protocol[State_contra, Params_contra]):
     """An environment whose reward is by how much an action brings the sand nearer to the goal."""
 
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """How many numbers an action has."""
 
-    def distance(self, state: State_contra, params: Params_contra) -> jax.Array: ...
+    def distance(self, state: State_contra, params: Params_contra) -> jax.Array:
+        """How far the sand is from the goal."""
 
-    def observe(self, state: State_contra, params: Params_contra) -> dict[str, jax.Array]: ...
+    def observe(self, state: State_contra, params: Params_contra) -> dict[str, jax.Array]:
+        """The observation of a state."""
 
 
 def checked(env: Shapes[Any, Any], action: Action, dtype: jax.typing.DTypeLike) -> jax.Array:

@@ -25,7 +25,8 @@ class Shape(Protocol):
     """
 
     @property
-    def weights(self) -> tuple[float, float]: ...
+    def weights(self) -> tuple[float, float]:
+        """The weights of sand above the shape and of sand below it."""
 
     def check(self, name: str) -> None:
         """ValueError, with the shape's name in the drawing, where its fields do not go together."""

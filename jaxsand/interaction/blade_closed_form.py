@@ -1,21 +1,8 @@
 """A blade's whole leg in closed form: its swath is taken up and set down as berms, as a heap ahead, and behind the start.
 
-The blade pushes a heap of height H before it (_mound.py). What sticks out of the heap's two flanks is left behind as berms,
-triangles at repose of cross section H^2 / (2 mu) each, mu = tan(angle of repose). A blade of width w that cuts d deep is in
-balance when they take what it cuts, w d:
-
-    H = sqrt(w d mu),   r = H / mu,   V_h = w H^2 / (2 mu) + (pi / 6) H^3 / mu^2,   l = V_h / (w d) = w / 2 + (pi / 6) r
-
-with r the berms' and the heap's reach and V_h the heap: a wedge across the blade and a quarter of a cone at each end. A
-heap of volume V leaves V / l to a unit of length, so that along the stroke, with intake q(s),
-
-    dV/ds = q(s) - a V / l,   l = w / 2 + (pi / 6) a r,
-
-a the share of the two flanks where a berm finds room. Beside walls or a closed edge a = 0: the heap keeps all, as the
-right triangle of peak sqrt(2 mu V / w) over its channel. By symmetry half a blade beside a wall is a blade twice as
-wide. Over a draining edge what stands beyond it or above its rim runs off (_overflow.py). A heap without room goes back
-to where it was taken from. Every amount is a whole number of quanta and what the cuts leave over goes to one cell, so
-that volume is kept as well as floats allow.
+The balance of heap and berms, H = sqrt(w d mu), and what walls and edges change: notebooks/site/theory/closed-forms.md
+("A blade's swath"). The heap is in _mound.py, what runs off over a draining edge in _overflow.py. Every amount is a whole
+number of quanta and what the cuts leave over goes to one cell, so that volume is kept as well as floats allow.
 """
 
 import math

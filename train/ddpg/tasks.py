@@ -71,6 +71,7 @@ class Probing:
     probe: Probe
 
     def world(self) -> tuple[Probe, None]:
+        """The environment and its parameters, of which it has none."""
         return self.probe, None
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
