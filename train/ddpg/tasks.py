@@ -10,7 +10,7 @@ import numpy as np
 from jaxsand.envs.library import RandomStrokes
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.goals import metrics
-from jaxsand.goals.layout import right
+from jaxsand.goals.success import right
 from jaxsand.goals.usual import usual_scene
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.stroke_loss import pushed

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsand.goals.layout import right, strokes_right
 from jaxsand.goals.metrics import iou
+from jaxsand.goals.success import right, strokes_right
 from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.learned.network import Params, StrokeNet, ends, judge, likeliest, spread
