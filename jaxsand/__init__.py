@@ -12,6 +12,12 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxsand import env as env
+    from jaxsand import forces as forces
+    from jaxsand import gym as gym
+    from jaxsand import task as task
+    from jaxsand import tasks as tasks
+    from jaxsand import trench as trench
     from jaxsand.envs import make as make
     from jaxsand.goals.drawing import read_drawing as read_drawing
     from jaxsand.goals.feasible import AtBest as AtBest
@@ -183,15 +189,17 @@ __all__ = [*_HOMES]
 _OTHER_NAMES = ("env", "forces", "gym", "task", "tasks", "trench")  # modules
 
 
-def __getattr__(name: str) -> Any:
-    """The public object of this name, imported now."""
-    if name == "__version__":
-        return metadata.version("jaxsand")
-    if name in _OTHER_NAMES:
-        return import_module(f"jaxsand.{name}")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'jaxsand' has no attribute {name!r}")
-    return getattr(import_module(f"jaxsand.{_HOMES[name]}"), name)
+if not TYPE_CHECKING:  # a type checker that saw this would let every misspelt name pass
+
+    def __getattr__(name: str) -> Any:
+        """The public object of this name, imported now."""
+        if name == "__version__":
+            return metadata.version("jaxsand")
+        if name in _OTHER_NAMES:
+            return import_module(f"jaxsand.{name}")
+        if name not in _HOMES:
+            raise AttributeError(f"module 'jaxsand' has no attribute {name!r}")
+        return getattr(import_module(f"jaxsand.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

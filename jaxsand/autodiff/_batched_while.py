@@ -56,8 +56,8 @@ class Loop:
         done = None if self.done is None else jax.vmap(self.done, in_axes=(axes, None, 0))
         return Loop(done, _Many(self.step, axes), self.bound, self.batch_axes + 1)
 
-    def ready(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
-        """Which maps stop before step k: booleans with the leading batch axes, one for a whole trailing batch."""
+    def finished(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
+        """Which maps are finished before step k: booleans with the leading batch axes, one for a whole trailing batch."""
         over = k >= self.bound
         return over if self.done is None else over | self.done(params, k, state)
 
@@ -77,12 +77,12 @@ class Loop:
         """Which maps had stopped before step k."""
         return jnp.zeros((), bool) if count is None else k >= count
 
-    def keep(self, ready: jax.Array, old: Tree, new: Tree) -> Tree:
-        """The old state of the maps that are ready, the new one of the others."""
-        if not self.batch_axes or not ready.ndim:
+    def keep(self, finished: jax.Array, old: Tree, new: Tree) -> Tree:
+        """The state after a step: the old one of the maps that were finished before it, the new one of the others."""
+        if not self.batch_axes or not finished.ndim:
             return new
         return jax.tree.map(
-            lambda x, y: jnp.where(ready.reshape(ready.shape + (1,) * (x.ndim - self.batch_axes)), x, y), old, new
+            lambda x, y: jnp.where(finished.reshape(finished.shape + (1,) * (x.ndim - self.batch_axes)), x, y), old, new
         )
 
     def put(self, tape: Tree, k: jax.Array, record: Tree) -> Tree:
@@ -184,34 +184,36 @@ def run(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree]:
     """Runs the loop: the last state, and the number of steps."""
 
     def advance(carry: Tree) -> Tree:
-        state, k, count, ready = carry
-        state = loop.keep(ready, state, loop.step(params, k, state))
-        k, count = k + 1, count + (~ready).astype(jnp.int32)
-        return state, k, count, ready | loop.ready(params, k, state)
+        state, k, count, finished = carry
+        state = loop.keep(finished, state, loop.step(params, k, state))
+        k, count = k + 1, count + (~finished).astype(jnp.int32)
+        return state, k, count, finished | loop.finished(params, k, state)
 
     zero = jnp.int32(0)
-    ready = loop.ready(params, zero, state)
+    finished = loop.finished(params, zero, state)
     state, _, count, _ = lax.while_loop(
-        lambda c: ~jnp.all(c[3]), advance, (state, zero, jnp.zeros(ready.shape, jnp.int32), ready)
+        lambda c: ~jnp.all(c[3]), advance, (state, zero, jnp.zeros(finished.shape, jnp.int32), finished)
     )
     return state, loop.taken(count)
 
 
 def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
-    """Runs the loop for reverse mode: the last state, the number of steps, the tape, and the memory of earlier states.
+    """Runs the loop, and keeps what reverse mode needs.
 
-    The tape holds the record of step k in place k % room, for the last `loop.room` steps. The memory is empty where there
-    cannot be more steps than that. Else it is a pair: the steps before which states were kept, -1 for a free slot, and these
-    states.
+    Returns:
+        The last state; the number of steps that each map took, None where all take `bound`; the tape, which holds what
+        step k recorded in place k % `loop.room`, for the last `loop.room` steps; and the memory, empty where the tape
+        holds every step. Else the memory is a pair: the steps before which states were kept, -1 for a free slot, and
+        these states.
     """
 
     def advance(carry: Tree) -> Tree:
-        state, k, count, ready, tape = carry
+        state, k, count, finished, tape = carry
         new, record = loop.step.recorded(params, k, state)
         tape = loop.put(tape, k % loop.room, record)
-        state = loop.keep(ready, state, new)
-        k, count = k + 1, count + (~ready).astype(jnp.int32)
-        return state, k, count, ready | loop.ready(params, k, state), tape
+        state = loop.keep(finished, state, new)
+        k, count = k + 1, count + (~finished).astype(jnp.int32)
+        return state, k, count, finished | loop.finished(params, k, state), tape
 
     def stretch(carry: Tree) -> Tree:
         carry, stride, (places, saved) = carry
@@ -226,9 +228,9 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
         return carry, stride, (places, saved)
 
     zero = jnp.int32(0)
-    ready = loop.ready(params, zero, state)
+    finished = loop.finished(params, zero, state)
     _, record = jax.eval_shape(loop.step.recorded, params, zero, state)
-    carry = (state, zero, jnp.zeros(ready.shape, jnp.int32), ready, loop.blank(loop.room, record))
+    carry = (state, zero, jnp.zeros(finished.shape, jnp.int32), finished, loop.blank(loop.room, record))
     if loop.bound <= loop.room:
         state, _, count, _, tape = lax.while_loop(lambda c: ~jnp.all(c[3]), advance, carry)
         return state, loop.taken(count), tape, ()

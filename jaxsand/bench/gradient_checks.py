@@ -48,6 +48,7 @@ class Case:
 
     @property
     def name(self) -> str:
+        """What the case is called in tables."""
         parts = [self._work(), f"{self.neighbours}"]
         if self.window:
             parts.append("window {} x {}".format(*self.window.size))

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxsand.cli.files import existing, folder, progress, read_text, write_json, written
+from jaxsand.cli.files import existing, folder, plausible, progress, read_text, write_json, written
 from jaxsand.cli.printing import plain_name, read_cell, show
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 
 def run_shape(options: argparse.Namespace) -> None:
+    """Runs `jaxsand shape`."""
     options.method = options.method or _suited(options.goal)
     _check_options(options)
     tell = progress()
@@ -63,6 +64,8 @@ def run_shape(options: argparse.Namespace) -> None:
     tell("")
     if target.found and target.found.reason:
         print(f"warning: strokes: {target.found.reason}{_dug_alone(target)}", file=sys.stderr)
+    if target.missed:
+        print(f"warning: goal: {_left_out(target, options)}", file=sys.stderr)
     show(options, report, _summary)
 
 
@@ -76,7 +79,9 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
         "paths": [[[round(float(v), 6) for v in point] for point in path] for path in target.paths],
         "lifted": result.lifted,
         "steps": result.steps,
-        **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
+        **(
+            {name: getattr(target, name) for name in ("optimal", "lower_bound", "missed")} if target.method == "plan" else {}
+        ),
         **({"search": _found(target.found) | _at_best(result) | {"reason": target.found.reason}} if target.found else {}),
         **result.figures,
         "seconds": total,
@@ -94,6 +99,8 @@ _ROWS = "heights in metres, first row at y = 0; with --first-row top, on top as 
 _OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".npz", ".svg", ".tif", ".tiff")
 _STROKES, _PUSHES = 24, 2000  # of a search for strokes that rise and sink, unless told otherwise
 _REFINED = 4000  # pushes by --refine, unless told otherwise
+_RESOLUTION = 6  # grid cells to a block's side, unless told otherwise
+_SPACING = 0.01  # m, unless told otherwise
 _DARK = 0.5  # of black: what a picture's free cells are darker than
 _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
 
@@ -177,6 +184,8 @@ def _summary(report: dict[str, Any]) -> str:
     how = f"{report['steps']} strokes"
     if report["method"] == "plan":
         proof = "proven shortest" if report["optimal"] else f"at least {report['lower_bound']} are needed"
+        if report["missed"]:
+            proof = f"over a part of the goal: {report['missed']} of its dug cells are left out"
         how = f"{report['steps']} steps ({proof})"
     if "search" in report:
         how += f" found in {report['search']['rollouts']:.0f} pushes"
@@ -365,6 +374,9 @@ def _read_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
     from jaxsand.goals.letters import read_heights
 
     heights = read_heights(existing(path), options.no_data)
+    spacing = _SPACING if options.spacing is None else options.spacing
+    if spacing > 0:
+        plausible(heights, spacing * max(heights.shape), str(path))
     return heights[::-1] if options.first_row == "top" else heights
 
 
@@ -372,6 +384,18 @@ def _drawn(options: argparse.Namespace) -> ValueError:
     other = "plan or search" if Path(options.goal).suffix.lower() == ".png" else "plan"
     return ValueError(
         f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method {other}"
+    )
+
+
+def _left_out(target: "Target", options: argparse.Namespace) -> str:
+    """What a plan over blocks leaves out of a goal, and what to do about it."""
+    from jaxsand.goals.metrics import dug
+
+    finer = " smaller --resolution" if (options.resolution or _RESOLUTION) > 1 else " finer goal"
+    other = "search" if target.kind == "image" else "search or optimise"
+    return (
+        f"{target.missed} of {int(dug(target.goal, target.depth).sum())} dug cells are left out, since the blocks of cells "
+        f"that they lie in are not dug deep enough in the mean; give a{finer}, or use --method {other}"
     )
 
 
@@ -398,8 +422,8 @@ def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
     from jaxsand.planning.pipeline import Layout
 
     depth = depth_mm if options.depth_mm is None else options.depth_mm
-    spacing = 0.01 if options.spacing is None else options.spacing
-    resolution = options.resolution or 6
+    spacing = _SPACING if options.spacing is None else options.spacing
+    resolution = options.resolution or _RESOLUTION
     scrapes = options.method in ("search", "optimise") and depth == 0
     for field, value in (("spacing", spacing), *(() if scrapes else (("depth-mm", depth),))):
         if not (math.isfinite(value) and value > 0):

@@ -4,8 +4,8 @@ They follow the protocol of gymnax 1.x: an environment is a static object, the s
 parameters, and the leaves of both may be vmapped; see `episode.Environment`.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import Field, fields, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import fields, replace
 from typing import Any, Literal, TypeVar, overload
 
 import jax
@@ -178,7 +178,8 @@ def _single(
 ) -> tuple[OnMap, MapParams] | tuple[OnSand, SandParams]:
     """The single stroke with the given options."""
     env = OnMap() if on is None else on
-    _known("single-stroke", params, fields(MapParams))
+    ours = [f.name for f in fields(MapParams)]
+    _known("single-stroke", params, ("on", "scene", *ours), ours)
     check_kinds({"on": env, **params})
     check_limit(params)
     if isinstance(env, OnMap):
@@ -259,20 +260,19 @@ Env = TypeVar("Env", MultiStroke, Excavate)
 
 def _of_kind(name: str, kind: type[Env], options: Mapping[str, Any], seed: int) -> tuple[Env, dict[str, Any]]:
     """An environment with those of the options that are its fields, and the others, which are its parameters'."""
-    own = {f.name for f in fields(kind)}
+    own: list[str] = sorted(f.name for f in fields(kind))
     chosen = {key: value for key, value in options.items() if key in own}
     params = {key: value for key, value in options.items() if key not in own}
     check_kinds(chosen)
-    _known(name, params, (f for f in fields(StrokeParams) if f.name in ("limit", "zones")))
+    _known(name, params, ("goals", "starts", "seed", "scene", "limit", "zones", *own), ("limit", "zones"))
     check_kinds(params)
     check_limit(params)
     check_whole("seed", seed, 0)
     return kind(**chosen), params
 
 
-def _known(name: str, options: Mapping[str, object], some: Iterable[Field[Any]]) -> None:
-    """Raises ValueError for an option that is none of the fields in `some`."""
-    names = [f.name for f in some]
+def _known(name: str, options: Mapping[str, object], allowed: Iterable[str], here: Collection[str]) -> None:
+    """Raises ValueError for an option that is not in `here`, naming all that the environment's kind allows."""
     for option in options:
-        if option not in names:
-            raise ValueError(f"{option}: no option of {name}; give some of {', '.join(names)}, or see help(jaxsand.make)")
+        if option not in here:
+            raise ValueError(f"{option}: no option of {name}; give some of {', '.join(allowed)}, or see help(jaxsand.make)")

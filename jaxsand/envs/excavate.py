@@ -148,18 +148,15 @@ class Excavate:
           Observation, state, reward, terminated, truncated, info.
         """
         del key
-        action = jnp.asarray(action, state.height.dtype)
-        if action.shape != (self.size,):
-            raise ValueError(f"action: got shape {list(action.shape)}; give {self.size} numbers")
+        action = episode.checked(self, action, state.height.dtype)
         before = (state.height, state.load)
         after, outcome, told = self.digs(params.scene, before, self.dig(action, params), params.zones)
         (height, load), terminated = self.stop.over(action, before, after)
         new = ExcavateState(state.goal, height, load, state.time + 1)
-        reward = self.distance(state, params) - self.distance(new, params)
-        truncated = (new.time >= params.limit) & ~terminated
-        return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome} | told
+        return episode.concluded(self, state, new, terminated, params, {"outcome": outcome} | told)
 
     step = episode.step  # `step_env`, and the next episode begins where that ended one
+    action_space = episode.action_space
 
     def digs(self, scene: Scene, before: Bed, dig: jax.Array, zones: Zones) -> tuple[Bed, jax.Array, Told]:
         """The map and the load that a dig [9] leaves, its outcome, and what zones have to tell."""
@@ -198,11 +195,6 @@ class Excavate:
         full = (state.load.high + state.load.low) * dx**2 / bucket.capacity
         load = jnp.clip(full, 0, 1)  # of a full bucket it may be a rounding error more
         return shown(state.goal, state.height, bucket.depth) | {"load": load.astype(jnp.float32)}
-
-    def action_space(self, params: ExcavateParams) -> Box:
-        """The space of actions."""
-        del params
-        return Box(-1, 1, (self.size,))
 
     def observation_space(self, params: ExcavateParams) -> Dict:
         """The space of observations."""

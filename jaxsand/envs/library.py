@@ -15,10 +15,7 @@ from jaxsand.envs.zones import NoZones, Zones
 from jaxsand.goals import metrics
 from jaxsand.goals.goal import Goal
 from jaxsand.goals.letters import stroke_list
-from jaxsand.goals.surfaces import rough_surface
-from jaxsand.interaction.outcome import check
-from jaxsand.relaxation.settling import settle_batch
-from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.goals.surfaces import rested, rough_surface
 from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene, blade_of
 
@@ -170,10 +167,7 @@ def surfaces(scene: Scene, starts: Starts, count: int, rng: np.random.Generator)
         return np.zeros(shape, np.float32)
     if not (0 <= starts.relief < np.inf and 0 < starts.scale < np.inf):
         raise ValueError(f"starts: got {starts}; give a relief of 0 m or more, and a scale above 0 cells")
-    rough = rough_surface(rng, shape, starts.relief, starts.scale)
-    rested = settle_batch(scene, rough.astype(np.float32), stop=UntilStill(bound=200_000))
-    check(rested)
-    return np.asarray(rested.height)
+    return rested(scene, rough_surface(rng, shape, starts.relief, starts.scale))
 
 
 def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray], zones: Zones | None) -> np.ndarray:

@@ -11,7 +11,7 @@ from jaxsand.envs import episode
 from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.heights import Heights, OwnDepth
 from jaxsand.envs.pushing import Batching, ByLength, Push, pushing
-from jaxsand.envs.spaces import Box, Dict
+from jaxsand.envs.spaces import Dict
 from jaxsand.envs.weights import Wanted, chosen, heights, shown, shown_spaces
 from jaxsand.envs.zones import NoZones, Told, Zones, kept
 from jaxsand.goals.goal import Goal, Power
@@ -300,17 +300,14 @@ class MultiStroke:
           Observation, state, reward, terminated, truncated, info.
         """
         del key
-        action = jnp.asarray(action, state.height.dtype)
-        if action.shape != (self.size,):
-            raise ValueError(f"action: got shape {list(action.shape)}; give {self.size} numbers")
+        action = episode.checked(self, action, state.height.dtype)
         after, outcome, told = self.pushed(params.scene, state.height, self.stroke(action, params), params.zones)
         after, terminated = self.stop.over(action, state.height, after)
         new = StrokeState(state.goal, after, state.time + 1)
-        reward = self.distance(state, params) - self.distance(new, params)
-        truncated = (new.time >= params.limit) & ~terminated
-        return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome} | told
+        return episode.concluded(self, state, new, terminated, params, {"outcome": outcome} | told)
 
     step = episode.step  # `step_env`, and the next episode begins where that ended one
+    action_space = episode.action_space
 
     def pushed(self, scene: Scene, height: jax.Array, stroke: jax.Array, zones: Zones) -> tuple[jax.Array, jax.Array, Told]:
         """The map that a stroke [4] or [6] (m) leaves, its outcome, and what zones have to tell."""
@@ -339,11 +336,6 @@ class MultiStroke:
     def observe(self, state: StrokeState, params: StrokeParams) -> dict[str, jax.Array]:
         """The observation of a state: its maps in units of the blade's depth, and weights that are maps (float32)."""
         return shown(state.goal, state.height, blade_of(params.scene).depth)
-
-    def action_space(self, params: StrokeParams) -> Box:
-        """The space of actions."""
-        del params
-        return Box(-1, 1, (self.size,))
 
     def observation_space(self, params: StrokeParams) -> Dict:
         """The space of observations."""

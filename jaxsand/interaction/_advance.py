@@ -45,6 +45,7 @@ class Ready:
     part: jax.Array
 
     def stand(self) -> Stand:
+        """What the next sub-step needs to know of how the tool stands here."""
         return Stand(self.sand.gates, self.sand.open, self.sand.stretch)
 
 
@@ -72,6 +73,7 @@ class Step:
 
     @property
     def together(self) -> int:
+        """How many maps of a batch are computed at a time."""
         return self.block.together
 
     def kept(self, part: jax.Array, flux: Fluxes, before: Fluxes) -> Fluxes:
@@ -86,12 +88,15 @@ class Step:
         raise NotImplementedError
 
     def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, Any]:
+        """The sand after step k, and the sand before it as the record."""
         return self(way, k, sand), sand
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
+        """The jvp, by JAX."""
         return Plain(self).push(way, k, record, dway, dsand)
 
     def pull(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
+        """The vjp, by JAX."""
         return Plain(self).pull(way, k, record, cotangent)
 
 
@@ -109,6 +114,7 @@ class Advance(Step):
     rest: Rest = bring_to_rest
 
     def done(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
+        """Whether the leg is complete before step k."""
         gone = (k - int(self.lowered)).astype(way.length.dtype) * (self.chunk * self.substep)
         return (k >= int(self.lowered)) & jnp.all(gone >= way.length)
 
@@ -116,6 +122,7 @@ class Advance(Step):
         return self.recorded(way, k, sand)[0]
 
     def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, Any]:
+        """The sand after step k, and what its derivative needs."""
         frame = frame_of(self.block.shape, way.start)
         first, by = self.block_of(way, frame, k)
         view, old = self.block.view(way, frame, first, sand.height)
@@ -247,6 +254,7 @@ class Advance(Step):
         return (way.bottom + (by - past) * way.rise) / way.quantum
 
     def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
+        """The jvp: of the step made again in its block."""
         if isinstance(record, Moving):
             return super().push(way, k, record, dway, dsand)
         inside = _Inside(self, way, k, record)
@@ -262,6 +270,7 @@ class Advance(Step):
         return Moving(height, None, flux, dsand.edge)
 
     def pull(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
+        """The vjp: of the step made again in its block."""
         if isinstance(record, Moving):
             return super().pull(way, k, record, cotangent)
         inside = _Inside(self, way, k, record)

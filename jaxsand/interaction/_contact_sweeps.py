@@ -17,7 +17,7 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Around, flows
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, stored
+from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, stored, total
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 
@@ -36,12 +36,15 @@ class Beside:
         return repeat(_SWEEP, self.sweeps, params, state)
 
     def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, State]:
+        """The state after the sweeps, and the state before them as the record."""
         return self(params, k, state), state
 
     def push(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
+        """The jvp, by JAX."""
         return Plain(self).push(params, k, record, dparams, dstate)
 
     def pull(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
+        """The vjp: written out for 4 and 8 neighbours, else by JAX."""
         bed, flow, around = params
         if not bed.by_links or not self.sweeps:
             return Plain(self).pull(params, k, record, cotangent)
@@ -134,12 +137,12 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
             bed, [flow.rate * g / length * t for g, length, t in zip(gates, lengths, tilt, strict=True)]
         )
     else:
-        drop = flow.rate * flux_adjoint.total(tilt[0])
+        drop = flow.rate * total(tilt[0])
     return Pulled(
         gain,
         -flow.rate * at(flux_adjoint.to_less_open(bed, around.open, per_length)),
         moved / (1 + around.stretch),
         -flux_adjoint.to_shape(lift * around.stretch, around.bottom),
-        -flux_adjoint.total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
+        -total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
         drop,
     )

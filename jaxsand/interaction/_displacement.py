@@ -20,6 +20,13 @@ from jaxsand.relaxation.sweep import Flow
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]
+Carried = tuple[jax.Array, jax.Array | None, jax.Array]
+"""Heights, what was lost, and what is being carried (quanta), while sand moves on from under a tool cell by cell."""
+
+
+def none_carried(params: Any, k: jax.Array, state: Carried) -> jax.Array:
+    """Whether no sand is being carried any more."""
+    return ~jnp.any(state[2] > 0)
 
 
 @jax.tree_util.register_dataclass

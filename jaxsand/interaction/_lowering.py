@@ -10,12 +10,12 @@ from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._advance import Step
 from jaxsand.interaction._block import Moving, Way, normal_of
+from jaxsand.interaction._displacement import Carried, none_carried
 from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at, truncate
 
 Params: TypeAlias = tuple[blade.Shares, jax.Array, jax.Array, tuple[jax.Array, jax.Array] | None]
-Carried: TypeAlias = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was lost, and what is carried (quanta)
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Lower(Step):
         params = (shares, holds, cover, over)
         into, scooped = blade.scooped(way.room, sand.scooped, taken)
         state = (old - taken, gone, taken - into)
-        (new, gone, carried), _ = repeat_until(_at_rest, Plain(_spread, 16), 2 * self.block.near, params, state)
+        (new, gone, carried), _ = repeat_until(none_carried, Plain(_spread, 16), 2 * self.block.near, params, state)
         new = self.block.put(whole, new + carried)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, whole, new, cover))
         lost = self.block.lose(way, view, sand.lost, None if gone is None else self.block.put(jnp.zeros_like(whole), gone))
@@ -65,8 +65,3 @@ def _spread(params: Params, k: jax.Array, state: Carried) -> Carried:
     kept, got, lost = blade.handed_on(shares, holds, carried, free)
     rest = truncate((1 - cover) * got)
     return h + rest + kept, None if gone is None or lost is None else gone + lost, got - rest
-
-
-def _at_rest(params: Params, k: jax.Array, state: Carried) -> jax.Array:
-    """Whether no sand is being carried any more."""
-    return ~jnp.any(state[2] > 0)

@@ -39,6 +39,7 @@ class Rim:
 
     @classmethod
     def of(cls, scene: Scene, job: Job, ground: jax.Array, sand: jax.Array, seen: jax.Array) -> "Rim":
+        """The rim of a scene that drains, before the leg."""
         assert job.bed.rim is not None
         dx, (rows, columns) = job.bed.spacing, scene.grid.shape
         return cls((columns * dx, rows * dx), job.bed.rim.level, ground, jnp.ones(2, sand.dtype), _from_edge(sand), seen)

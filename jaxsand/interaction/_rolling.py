@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.autodiff.while_loop import Plain, Tree, repeat_until
+from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import Step
 from jaxsand.interaction._block import Block, Moving, View, pose_ahead, rotated
+from jaxsand.interaction._displacement import Carried, none_carried
 from jaxsand.interaction._frame import Frame, frame_of, shifted
 from jaxsand.interaction._wheel import Stand, Track
 from jaxsand.interaction.resting import bring_to_rest
@@ -20,7 +21,6 @@ from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.tools import Pose
 
 Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)
-Carried = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was lost, and what is carried (quanta)
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Touchdown(_OfWheel):
         gone = None if view.beyond is None else jnp.zeros_like(old)
         onward = Plain(_Onward(self.block), 16)
         params = (track, view, wheel.radial(track, frame, here), here)
-        (new, gone, carried), _ = repeat_until(_at_rest, onward, 2 * self.block.size, params, (old - taken, gone, taken))
+        (new, gone, carried), _ = repeat_until(none_carried, onward, 2 * self.block.size, params, (old - taken, gone, taken))
         new = new + carried
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, here.cover))
         lost = self.block.lose(way, view, sand.lost, gone)
@@ -62,11 +62,6 @@ class _Onward:
     def __call__(self, params: tuple[Track, View, wheel.Shares, Stand], k: jax.Array, state: Carried) -> Carried:
         track, view, shares, here = params
         return wheel.handed_on(self.block, track, view, shares, here, state)
-
-
-def _at_rest(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
-    """Whether no sand is being carried any more."""
-    return ~jnp.any(state[2] > 0)
 
 
 @dataclass(frozen=True)

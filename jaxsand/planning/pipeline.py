@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxsand.goals import metrics
 from jaxsand.goals.goal import Goal, as_goal
+from jaxsand.goals.surfaces import rested
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import Shaped, follow_frames
 from jaxsand.interaction.stepped import SteppedPush
@@ -21,8 +22,7 @@ from jaxsand.planning.binary import Cell, connected_pieces, plan
 from jaxsand.planning.gradient import Optimised
 from jaxsand.planning.learned.stages import Planned
 from jaxsand.planning.search import SandPlan
-from jaxsand.relaxation.settling import settle, steepest_slope
-from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -80,6 +80,8 @@ class Target:
       lower_bound: no plan has fewer steps; None where nothing was proven.
       found: what a method that tries strokes on sand reported.
       weighted: the goal with its weights, if some cell that is not free costs more or less than another.
+      missed: how many of the goal's dug cells the blade does not pass over, by a plan over blocks of cells; nothing is
+        proven of such a plan.
     """
 
     name: str
@@ -94,6 +96,7 @@ class Target:
     lower_bound: float | None = None
     found: SandPlan | Optimised | Planned | None = None  # what a search on real sand says of itself
     weighted: Goal | None = None
+    missed: int = 0
 
     @property
     def wanted(self) -> Goal | np.ndarray:
@@ -175,7 +178,8 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
     depth.
 
     The map is divided into blocks of about `layout.cell` grid cells a side, none wider than the blade, and a block is dug
-    where its mean is deep enough.
+    where its mean is deep enough. What is dug in the goal but not in its block's mean is left out: `missed` says how many
+    cells are, and then nothing is proven.
 
     Raises:
       ValueError: for a goal that is not finite, smaller than a block, or nowhere deep enough.
@@ -204,7 +208,20 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
         path = np.stack([(columns + 0.5) * width, (counts[0] - rows - 0.5) * height], 1)
         paths.append(np.concatenate([path, path[-1:]]) if len(path) == 1 else path)
         optimal, lower = optimal and found.optimal, lower + found.lower_bound
+    missed = int((np.asarray(metrics.dug(target.goal, layout.depth)) & ~_passed_over(dig, target.goal.shape, layout)).sum())
+    if missed:
+        return replace(target, paths=tuple(paths), missed=missed)
     return replace(target, paths=tuple(paths), optimal=optimal, lower_bound=lower)
+
+
+def _passed_over(dig: np.ndarray, shape: tuple[int, ...], layout: Layout) -> np.ndarray:
+    """Which grid cells [H, W] have their centre under the blade where it digs the blocks `dig` (row 0 on top)."""
+    half = layout.oversize * layout.cell / 2 + 1e-9
+    under = [
+        np.abs((np.arange(cells) + 0.5)[:, None] - (np.arange(blocks) + 0.5) * cells / blocks) <= half
+        for cells, blocks in zip(shape, dig.shape, strict=True)
+    ]
+    return np.einsum("ib,bc,jc->ij", under[0], np.flipud(dig), under[1]) > 0
 
 
 def glyph_target(strokes: np.ndarray, name: str) -> Target:
@@ -274,9 +291,7 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
         return np.zeros(scene.grid.shape, np.float32)
     metrics.fits(scene, before, "surface")
     tell("settling the surface")
-    rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
-    check(rested)
-    return np.asarray(rested.height)
+    return rested(scene, np.asarray(before))
 
 
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:

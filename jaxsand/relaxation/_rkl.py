@@ -42,6 +42,7 @@ class Surges:
         return u, lost, tuple(m * cut for m in last)
 
     def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, Tree]:
+        """The state after the stages, and for its derivative two bits for each link and stage, or else the state before."""
         bed, around, _ = params
         if not bed.by_links:
             return Plain(self).recorded(params, k, state)
@@ -62,6 +63,7 @@ class Surges:
         return (u, lost, tuple(m * cut for m in last)), codes
 
     def push(self, params: Params, k: jax.Array, record: Tree, dparams: Tree, dstate: State) -> State:
+        """The jvp, from which links were active."""
         bed, around, _ = params
         if not bed.by_links:
             return Plain(self).push(params, k, record, dparams, dstate)
@@ -88,6 +90,7 @@ class Surges:
         return halo(dh, 0.0), None, flux_adjoint.from_lattice(bed, last)
 
     def pull(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
+        """The vjp, from which links were active."""
         bed, around, _ = params
         if not bed.by_links:
             return Plain(self).pull(params, k, record, cotangent)

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -53,7 +54,8 @@ def here(tmp_path, monkeypatch):
     np.save(tmp_path / "dip.npy", np.full((12, 12), -0.01))
     np.save(tmp_path / "holes.npy", np.where(np.arange(12) == 8, -9999, np.zeros((12, 12), int)))
     np.save(tmp_path / "nan.npy", np.full((12, 12), np.nan))
-    np.save(tmp_path / "small.npy", -np.ones((3, 3)))
+    np.save(tmp_path / "small.npy", np.full((3, 3), -0.01))
+    np.save(tmp_path / "raw.npy", np.where(np.arange(144).reshape(12, 12) == 7, -9999, -0.01))
     np.save(tmp_path / "words.npy", np.array([["a"]]))
     np.save(tmp_path / "pile.npy", np.eye(12, dtype=np.float32) * 0.05)
     Image.new("L", (30, 20), 255).save(tmp_path / "white.png")
@@ -155,6 +157,16 @@ BAD = {
     ),
     "elevations as a surface": (["shape", "S", "--surface", "land.tif"], r"surface: got 'land.tif'; give .*\.npy file"),
     "first row of a letter": (["shape", "S", "--first-row", "top"], r"first-row: has an effect on \.npy files only"),
+    "a value for no data as a goal": (
+        ["shape", "raw.npy"],
+        r"raw\.npy: got 1 cells more than 0\.12 m above or below level sand, such as -9999, .*--no-data -9999",
+    ),
+    "a value for no data to search": (["shape", "raw.npy", "--method", "search"], r"raw\.npy: got 1 cells more than"),
+    "a value for no data as a surface": (["shape", "dip.npy", "--surface", "raw.npy"], r"raw\.npy: got 1 cells more"),
+    "a value for no data to settle": (
+        ["settle", "raw.npy", "--out-file", "x.npy"],
+        r"raw\.npy: got 1 cells more than 1\.2 m above or below -0\.01 m, such as -9999, .*--no-data -9999",
+    ),
     "unknown surface": (["shape", "S", "--surface", "moon"], "surface: got 'moon'"),
     "surface of another size": (["shape", "S", "--surface", "flat.npy"], r"surface: got shape \[12, 12\]"),
     "folder under a file": (["shape", "S", "--out", "a-file/x"], "out: cannot write to a-file/x"),
@@ -543,6 +555,26 @@ def test_pictures_do_not_depend_on_the_users_matplotlib(tmp_path):
         assert done.returncode == 0, done.stderr
         pictures.append((tmp_path / "plan-map.png").read_bytes())
     assert pictures[0] == pictures[1]
+
+
+def test_what_a_plan_leaves_out_is_told():
+    """Nothing is proven shortest that leaves out a part of the goal; see `test_pipeline`."""
+    from jaxsand.cli.shape import _left_out, _summary
+    from jaxsand.planning import pipeline
+
+    goal = np.zeros((48, 48))
+    goal[6:12, 6:30] = goal[27:33, 6:30] = -0.0075
+    target = pipeline.height_target(goal, "heights", "straddle", pipeline.Layout(depth=0.0075))
+    told = _left_out(target, SimpleNamespace(resolution=None))
+    assert told.startswith("144 of 288 dug cells are left out")
+    assert "a smaller --resolution, or use --method search" in told
+    figures = dict.fromkeys(
+        ("iou", "l2_reduction", "l2_reduction_with_berms", "volume_error", "max_slope_deg"), 0.5
+    ) | dict.fromkeys(("seconds_compile", "seconds_run", "seconds_plan", "seconds_draw"), 1.0)
+    report = {"goal": "x", "goal_kind": "heights", "method": "plan", "steps": 3, "files": [], "optimal": target.optimal}
+    said = _summary(report | figures | {"lower_bound": target.lower_bound, "missed": target.missed})
+    assert "3 steps (over a part of the goal: 144 of its dug cells are left out)" in said
+    assert "proven" not in said
 
 
 def test_cells_without_data_are_solid_to_settling(here, capsys):

@@ -117,7 +117,8 @@ def test_what_is_left_over_of_blocks_is_planned_too():
     layout = pipeline.Layout(depth=0.0075)
     found = pipeline.height_target(goal, "heights", "two", layout)
     assert len(found.paths) == 2
-    assert found.optimal
+    assert found.missed == 40  # the trench's first row lies in a block of which it is a sixth
+    assert found.optimal is found.lower_bound is None
     for path, (low, high) in zip(sorted(found.paths, key=lambda p: p[0, 1]), ((0.10, 0.16), (0.48, 0.53)), strict=True):
         assert np.all((path[:, 1] > low) & (path[:, 1] < high))
     for side in range(6, 40):  # no path misses what lies at an edge, and the blade covers every block
@@ -127,6 +128,22 @@ def test_what_is_left_over_of_blocks_is_planned_too():
         reach = layout.oversize * layout.cell * layout.spacing / 2
         assert path[:, 1].max() + reach >= side * layout.spacing - 1e-9
         assert path[:, 1].max() < side * layout.spacing
+
+
+def test_what_is_left_out_of_a_goal_is_counted_and_nothing_proven():
+    """A trench half in each of two rows of blocks, and one of two cells, beside one that fills its blocks."""
+    layout = pipeline.Layout(depth=0.0075)
+    goal = np.zeros((48, 48))
+    goal[6:12, 6:30] = -0.0075
+    whole = pipeline.height_target(goal, "heights", "whole", layout)
+    assert (whole.missed, whole.optimal, whole.lower_bound) == (0, True, 3)
+    for second in (slice(27, 33), slice(26, 28)):
+        more = goal.copy()
+        more[second, 6:30] = -0.0075
+        found = pipeline.height_target(more, "heights", "more", layout)
+        passed = (second.stop - second.start) * 24
+        assert (found.missed, found.optimal, found.lower_bound) == (passed, None, None)
+        assert np.array_equal(found.paths[0], whole.paths[0])
 
 
 def test_blocks_of_whole_cells_lie_as_ever():
