@@ -16,7 +16,6 @@ from jaxsand.scene.progress import Tell
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Blade
 
-
 _WIDTHS = (0.5, 1.0, 2.0)  # of the blades to choose from, in those of the target's own
 _THICKNESS = 1.5  # spacings
 

@@ -86,8 +86,8 @@ BAD = {
     "broken heights": (["shape", "broken.npy"], r"broken.npy: cannot be read as a \.npy"),
     "cube of heights": (["shape", "cube.npy"], r"cube.npy: got shape \[2, 2, 2\]"),
     "level heights": (["shape", "flat.npy", "--method", "plan"], "goal: .*nothing to dig"),
-    "heights not finite": (["shape", "nan.npy"], "goal: got 144 cells that are not finite"),
-    "too few heights": (["shape", "small.npy"], "goal: .*fewer than the 6"),
+    "heights not finite": (["shape", "nan.npy", "--method", "plan"], "goal: got 144 cells that are not finite"),
+    "too few heights": (["shape", "small.npy", "--method", "plan"], "goal: .*fewer than the 6"),
     "missing drawing": (["shape", "none.json"], "none.json: no such file"),
     "broken drawing": (["shape", "broken.json"], "broken.json: cannot be read as a drawing"),
     "drawing of two corners": (["shape", "corners.json"], r"shapes\[1\]\.points: got 2 of them; give the corners"),
@@ -100,8 +100,14 @@ BAD = {
     "drawing of two spacings": (["shape", "pit.json", "--spacing", "0.02"], "spacing: pit.json gives its own; leave"),
     "drawing with no data": (["shape", "pit.json", "--no-data", "0"], r"no-data: has an effect on \.npy files only"),
     "drawing with a start": (["shape", "pit.json", "--start", "1,1"], "start: pit.json is no map"),
-    "plan of a drawing that is free": (["shape", "pad.json"], "method: 'plan' knows no free cells, and no weights"),
-    "plan of a drawing with weights": (["shape", "strict.json"], "method: 'plan' knows no free cells, and no weights"),
+    "plan of a drawing that is free": (
+        ["shape", "pad.json", "--method", "plan"],
+        "method: 'plan' knows no free cells, and no weights",
+    ),
+    "plan of a drawing with weights": (
+        ["shape", "strict.json", "--method", "plan"],
+        "method: 'plan' knows no free cells, and no weights",
+    ),
     "strokes of a drawing": (["shape", "pit.json", "--method", "strokes"], "method: 'strokes' pushes a glyph's own strokes"),
     "start off the letter": (["shape", "S", "--start", "0,0"], r"start: got \(0, 0\)"),
     "start of one number": (["shape", "S", "--start", "3"], "start: got '3'"),
@@ -116,12 +122,12 @@ BAD = {
     "resolution of none": (["shape", "S", "--resolution", "0"], "resolution: got '0'"),
     "resolution beyond reason": (["shape", "S", "--resolution", "9999"], "resolution: got 9999"),
     "goal without data": (
-        ["shape", "holes.npy", "--no-data", "-9999"],
+        ["shape", "holes.npy", "--method", "plan", "--no-data", "-9999"],
         "goal: got 12 cells that are not finite; fill .*; or use --method search or optimise, to which they are free",
     ),
     "goal that is free": (["shape", "nan.npy", "--method", "search"], "goal: got NaN, free, in every cell"),
     "free cells of a plan": (
-        ["shape", "dip.npy", "--free", "cube.npy"],
+        ["shape", "dip.npy", "--method", "plan", "--free", "cube.npy"],
         "free: has an effect with --method search, optimise",
     ),
     "free cells of a letter": (
@@ -392,7 +398,9 @@ def test_a_drawing_is_planned(here, name):
     from jaxsand.cli.parser import _parser
     from jaxsand.cli.shape import _target
 
-    target = _target(_parser().parse_args(["shape", f"{name}.json", "--resolution", "3", "--depth-mm", "4"]))
+    target = _target(
+        _parser().parse_args(["shape", f"{name}.json", "--method", "plan", "--resolution", "3", "--depth-mm", "4"])
+    )
     assert (target.kind, target.method, target.drawn, target.weighted) == ("drawing", "plan", True, None)
     assert len(target.paths) == 1
     assert np.all(abs(target.paths[0] - 0.12) < [0.06, 0.04])

@@ -164,7 +164,7 @@ def test_a_recording_takes_no_more_memory_than_its_frames(monkeypatch):
 
     monkeypatch.setattr(pipeline, "check", lambda _: None)  # what stands in for a push is no result
 
-    def program(scene, points):
+    def program(scene, points, _):
         def run(height, path):
             frames = np.zeros((points - 1, *height.shape), np.float32)
             return SimpleNamespace(height=np.asarray(height) + 1, outcome=np.zeros((), int)), frames
@@ -189,8 +189,8 @@ def test_one_push_gives_a_strokes_result_and_its_recording(monkeypatch):
     target = pipeline.Target("one", "glyph", "strokes", GLYPHS, level, (np.reshape(stroke, (2, 2)),), False, 0.0075)
     usual, pushes = pipeline._program, []
 
-    def program(scene, points):
-        run, seconds = usual(scene, points)
+    def program(scene, points, columns):
+        run, seconds = usual(scene, points, columns)
         return lambda height, path: pushes.append(path) or run(height, path), seconds
 
     monkeypatch.setattr(pipeline, "_program", program)
