@@ -72,7 +72,7 @@ def _left_by(height: jax.Array, stroke: jax.Array, sand: jax.Array) -> jax.Array
         given = jnp.minimum(load, here[1])
         rest = load - given
         kept = rest * jnp.exp(-part / (_LOST * width))
-        return kept, (given / jnp.maximum(here[1], 1e-30), (rest - kept) / part / 2)
+        return kept, (_over(given, here[1]), (rest - kept) / part / 2)
 
     load, (filled, lost) = jax.lax.scan(on, jnp.zeros_like(part), (taken, lacking), unroll=8)
     walls = jnp.maximum(at(jnp.array([-0.5, 0.5]) * (width + spacing))[0] - bottom[:, None], 0)
@@ -89,7 +89,17 @@ def _left_by(height: jax.Array, stroke: jax.Array, sand: jax.Array) -> jax.Array
     inner = jnp.minimum(height, floor) + jnp.maximum(floor - height, 0) * filled[k]
     inner = jnp.where(slid, jnp.maximum(inner, slope), inner)
     outer = jnp.where(slid, jnp.minimum(height, slope), height)
-    outer += jnp.maximum(jnp.sqrt(2 * lost[k] * repose) - repose * jnp.maximum(beside, 0), 0)
+    outer += jnp.maximum(_root(2 * lost * repose)[k] - repose * jnp.maximum(beside, 0), 0)
     beyond = along - length - thick / 2
-    heap = jnp.maximum(jnp.sqrt(2 * load / width * repose) - repose * beyond, 0) * within * (beyond > 0)
+    heap = jnp.maximum(_root(2 * load / width * repose) - repose * beyond, 0) * within * (beyond > 0)
     return height + covered * (within * (inner - height) + (1 - within) * (outer - height)) + heap
+
+
+def _over(a: jax.Array, b: jax.Array) -> jax.Array:
+    """a / b; 0 where b is 0."""
+    return jnp.where(b > 0, a / jnp.where(b > 0, b, 1), 0)
+
+
+def _root(x: jax.Array) -> jax.Array:
+    """The square root of what is 0 or more, with the derivative 0 at 0."""
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)
