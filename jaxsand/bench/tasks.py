@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -12,11 +13,15 @@ from jaxsand.goals.feasible import at_best
 from jaxsand.goals.goal import as_goal
 from jaxsand.goals.tasks import TASKS, Task, figures, make_task
 from jaxsand.planning.gradient import optimise_strokes
+from jaxsand.planning.learned.policy import load_policy
+from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Job, Rising
 from jaxsand.planning.search.rollouts import Effort
 from jaxsand.planning.search.strokes import finish
+from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.progress import Tell, quiet
+from jaxsand.scene.scene import Scene, blade_of
 
 Method = Callable[[Job, float, np.random.Generator], earth.Found]
 
@@ -25,8 +30,14 @@ RIVALS: dict[str, Method] = {
     "coverage": earth.coverage_paths,
     "least work": earth.transported,
 }
-SEARCH, GRADIENTS = "plan_sand", "plan_sand and gradients"
-METHODS = (*RIVALS, SEARCH, GRADIENTS)
+SEARCH, CHOICE, GRADIENTS, POLICY = "plan_sand", "plan_sand with four blades", "plan_sand and gradients", "policy"
+METHODS = (*RIVALS, SEARCH, CHOICE, GRADIENTS, POLICY)
+WIDTHS = (0.75, 1.0, 1.5, 2.0)
+"""Of the four blades, in those of the task's own."""
+
+PUBLISHED: dict[str, float] = {"their policy": 3.4, "their coverage paths": 4.8, "their random actions": 7.2}
+"""Mean errors (mm) that Kreis et al. 2025 (arXiv:2509.06469) published, by another tool in another simulator, on 400 goals
+such as rectangle, L and polygon, of which their data set is not public."""
 
 
 def bench_tasks(
@@ -35,14 +46,16 @@ def bench_tasks(
     methods: tuple[str, ...] = METHODS,
     instances: int = 1,
     pushes: int = 500,
+    strokes: int | None = None,
     seed: int = 0,
 ) -> list[dict[str, Any]]:
     """A row for each task and method, with means over the instances (the worst is `worst_mm`); see `figures`.
 
-    Every method may use as many strokes as the task allows, and simulate `pushes` pushes; a gradient counts as what it
-    costs. `path_m` is the length of the strokes, and `moved` the volume (m^3) that they moved, summed over the strokes.
-    `at_best_mm` is the mean |height - goal| of the map that is nearest by the goal's cost, of all that repose and volume
-    allow, and `distance_at_best` (m) what no method's `distance` can be below (see `at_best`).
+    Every method may use as many strokes as the task allows, but at most `strokes`, and simulate `pushes` pushes; a gradient
+    counts as what it costs. The policy's strokes are as deep as the goal, and are not tried. `path_m` is the length of the
+    strokes, and `moved` the volume (m^3) that they moved, summed over the strokes. `at_best_mm` is the mean
+    |height - goal| of the map that is nearest by the goal's cost, of all that repose and volume allow, and
+    `distance_at_best` (m) what no method's `distance` can be below (see `at_best`).
 
     Raises:
       ValueError: for a task or a method that does not exist.
@@ -55,7 +68,8 @@ def bench_tasks(
     for name in names:
         for method in methods:
             tell(f"{name}: {method}")
-            found = [_one(make_task(name, key), method, pushes, seed) for key in range(seed, seed + instances)]
+            some = [_at_most(make_task(name, key), strokes) for key in range(seed, seed + instances)]
+            found = [_one(task, method, pushes, seed) for task in some]
             worst = {"worst_mm": max(one["mean_mm"] for one in found)}
             rows.append(
                 {"task": name, "method": method, **{key: _mean([one[key] for one in found]) for key in found[0]}, **worst}
@@ -72,36 +86,61 @@ def _mean(values: list[float | None]) -> float | None:
 def _one(task: Task, method: str, pushes: int, seed: int) -> dict[str, Any]:
     """The figures of a method on an instance of a task."""
     began = time.perf_counter()
-    plan, effort = _planned(task, method, pushes, seed)
+    scene, plan, effort = _planned(task, method, pushes, seed)
     seconds = time.perf_counter() - began
     best = at_best(task.scene, task.start, task.goal)
-    maps = finish(task.scene, plan[None], 0, task.start[None])[:, 0]
+    maps = finish(scene, plan[None], 0, task.start[None])[:, 0]
+    run = plan[:, plan.shape[1] // 2 :] - plan[:, : plan.shape[1] // 2]
     moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in pairwise(maps))
     return {
         **figures(task, maps[-1]),
         "at_best_mm": figures(task, best.height)["mean_mm"],
         "distance_at_best": best.distance_bound,
         "strokes": float(len(plan)),
-        "path_m": float(np.hypot(plan[:, 3] - plan[:, 0], plan[:, 4] - plan[:, 1]).sum()),
+        "path_m": float(np.hypot(run[:, 0], run[:, 1]).sum()),
         "moved": moved * float(task.scene.grid.spacing) ** 2,
         "pushes": effort.cost,
         "seconds": seconds,
     }
 
 
-def _planned(task: Task, method: str, pushes: int, seed: int) -> tuple[np.ndarray, Effort]:
-    """The strokes [n, 6] (m) of a method, and what they cost."""
+def _at_most(task: Task, strokes: int | None) -> Task:
+    """The task with no more strokes than these."""
+    return task if strokes is None else replace(task, strokes=min(strokes, task.strokes))
+
+
+def _planned(task: Task, method: str, pushes: int, seed: int) -> tuple[Scene, np.ndarray, Effort]:
+    """The scene with the blade, the strokes [n, 6] or [n, 4] (m) of a method, and what they cost."""
     if method in RIVALS:
         job = Job(task.scene, task.start, as_goal(task.scene, task.goal), task.strokes, Rising())
         (plan, _), effort = RIVALS[method](job, pushes, np.random.default_rng(seed))
-        return plan, effort
+        return task.scene, plan, effort
+    if method == POLICY:
+        return _by_policy(task)
+    blade = blade_of(task.scene)
+    tools = [replace(blade, width=times * float(blade.width)) for times in WIDTHS] if method == CHOICE else []
     budget = pushes // 2 if method == GRADIENTS else pushes
     found = plan_sand(
-        task.scene, task.start, task.goal, strokes=task.strokes, actions=Rising(), budget=max(1, budget), seed=seed
+        task.scene,
+        task.start,
+        task.goal,
+        strokes=task.strokes,
+        actions=Rising(),
+        budget=max(1, budget),
+        seed=seed,
+        tools=tools,
     )
     plan, effort = found.strokes.reshape(-1, 6), found.effort
     left = int(pushes - effort.cost)
     if method == GRADIENTS and len(plan) and left > 0:
         refined = optimise_strokes(task.scene, task.goal, start=task.start, guess=plan, budget=left, key=seed)
-        return refined.strokes, effort + Effort(full=refined.spent)
-    return plan, effort
+        return task.scene, refined.strokes, effort + Effort(full=refined.spent)
+    return replace(task.scene, tool=found.tool or blade), plan, effort
+
+
+def _by_policy(task: Task) -> tuple[Scene, np.ndarray, Effort]:
+    """The shipped policy's strokes, by a blade as deep as the goal lies below height 0."""
+    depth = -min(0.0, float(np.nanmin(np.asarray(task.goal.height))))
+    scene = replace(task.scene, tool=replace(blade_of(task.scene), depth=depth))
+    found = plan_by_policy(load_policy(), sand_loss(scene, task.start, task.goal), task.strokes, Stages(0, 0), quiet)
+    return scene, found.strokes, Effort(full=found.calls)

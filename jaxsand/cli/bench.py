@@ -85,15 +85,23 @@ def _device_for_each_core() -> None:
 def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
     """The options of `bench strokes` and of `bench tasks`, of which other benches have none."""
     if options.what not in ("strokes", "tasks"):
-        for option in ("goals", "calls", "seeds", "methods"):
+        for option in ("goals", "calls", "seeds", "methods", "strokes"):
             if getattr(options, option) is not None:
                 raise ValueError(f"{option}: has an effect on bench strokes and bench tasks only; leave it out")
         return {}
     methods = tuple(name.strip() for name in options.methods.split(",")) if options.methods else ()
     if options.what == "tasks":
         names = tuple(name.strip() for name in options.goals.split(",")) if options.goals else ()
-        given = {"names": names, "methods": methods, "instances": options.seeds, "pushes": options.calls}
+        given = {
+            "names": names,
+            "methods": methods,
+            "instances": options.seeds,
+            "pushes": options.calls,
+            "strokes": options.strokes,
+        }
         return {name: value for name, value in given.items() if value}
+    if options.strokes is not None:
+        raise ValueError("strokes: has an effect on bench tasks only; leave it out")
     if options.goals not in (None, *_STROKE_GOALS):
         raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(_STROKE_GOALS)}")
     return {

@@ -175,6 +175,7 @@ def _bench(commands: Any) -> None:
         "--goals", metavar="A,B", help="strokes: letters, turned, rough, or eight (letters); tasks: by name (all)"
     )
     p.add_argument("--methods", metavar="A,B", help="strokes, tasks: methods by name (all)")
+    p.add_argument("--strokes", type=count, metavar="N", help="tasks: at most so many strokes (each task's own number)")
     p.add_argument(
         "--out", type=path_name, metavar="DIR", help="folder for the report and its figure; strokes goes on there"
     )

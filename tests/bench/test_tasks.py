@@ -53,9 +53,11 @@ def test_names_that_do_not_exist_are_refused():
 def test_the_command_passes_its_options_on(monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(tasks, "bench_tasks", lambda tell, **given: asked.append(given) or [{"task": "pad", "mean_mm": 1.0}])
-    given = ["--goals", "pad,ramp", "--methods", "coverage", "--calls", "7", "--seeds", "2", "--seed", "3"]
+    given = ["--goals", "pad,ramp", "--methods", "coverage", "--calls", "7", "--seeds", "2", "--seed", "3", "--strokes", "5"]
     assert main(["bench", "tasks", *given, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["tasks"] == [{"task": "pad", "mean_mm": 1.0}]
-    assert asked == [{"seed": 3, "names": ("pad", "ramp"), "methods": ("coverage",), "instances": 2, "pushes": 7}]
+    assert asked == [
+        {"seed": 3, "names": ("pad", "ramp"), "methods": ("coverage",), "instances": 2, "pushes": 7, "strokes": 5}
+    ]
     assert main(["bench", "strokes", "--goals", "pad"]) == 2
     assert "goals: got 'pad'; give one of letters, turned" in capsys.readouterr().err

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from jaxsand.goals import metrics
+from jaxsand.goals.feasible import at_best
 from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search.actions import Actions, Flat, Job, Lattice, Path, Rising, Steps, longest_stroke
@@ -37,7 +38,7 @@ class SandPlan:
         `Goal` with weights says.
       after: distance (m) of `height` from the goal.
       lower_bound: proven: no plan of as many strokes as were allowed, however placed, comes closer than this (m). With
-        heights of their own it is what the volume alone allows.
+        heights of their own it is what volume and repose allow (see `at_best`).
       estimate: a guess (m) of what could be reached: what is left if every stroke gains as much as the best of all that were
         tried.
       effort: how many pushes were simulated in full, and how many roughly (see `plan_sand`).
@@ -158,7 +159,7 @@ def plan_sand(
     if left > before:  # `follow` leaves slightly other maps than the search's own pushes
         paths, after, left = [], height, before
     if isinstance(actions, Rising | Flat):
-        bound = volume_distance(scene, height, wanted)
+        bound = max(volume_distance(scene, height, wanted), at_best(scene, height, wanted).distance_bound if before else 0.0)
     else:
         bound = least_distance(scene, height, wanted, strokes, longest_stroke(scene, actions))
     estimate = min(left, max(0.0, before - strokes * effort.gain))
