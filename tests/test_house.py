@@ -1,6 +1,7 @@
 """The house's own rules: what may be imported where, and what its public names say."""
 
 import ast
+import re
 from pathlib import Path
 
 import jaxsand
@@ -77,3 +78,20 @@ def test_nothing_tells_to_run_the_learners_without_saying_where_they_are():
                 told += 1
                 assert "checkout" in node.value, f"{path}: {node.value}"
     assert told
+
+
+FORBIDDEN = {"march"}  # private words for what the field has a name for
+
+
+def words(tree):
+    """The words of every name that a file defines or uses: `batch_of_maps` and `BatchOfMaps` have three."""
+    for node in ast.walk(tree):
+        for name in (getattr(node, field, None) for field in ("name", "id", "attr", "arg")):
+            if isinstance(name, str):
+                yield from (word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name))
+
+
+def test_the_code_uses_the_words_of_the_field():
+    for path in PACKAGE.rglob("*.py"):
+        used = {word.removesuffix("s") for word in words(ast.parse(path.read_text(encoding="utf-8")))}
+        assert not used & FORBIDDEN, f"{path}: {used & FORBIDDEN}"

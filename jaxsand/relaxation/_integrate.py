@@ -27,7 +27,7 @@ Swept: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, Rate]
 
 
 @dataclass(frozen=True)
-class March:
+class SweepLoop:
     """A loop over groups of `interval` sweeps, which ends when no slope exceeds repose by more than a tolerance.
 
     Attributes:
@@ -52,13 +52,13 @@ class March:
         return (state[0], state[1]), taken * self.interval
 
 
-def march(
+def sweep_loop(
     bed: Bed,
     around: Nothing | Partial,
     scheme: Relaxation | Pairwise | Schedule,
     tolerance: jax.Array | None,
     interval: int,
-) -> March:
+) -> SweepLoop:
     """The loop of a scheme on this bed; without a tolerance it runs to its bound.
 
     The quantum of the fluxes is chosen anew for each group, from the largest height before it. So the quantum becomes finer
@@ -87,7 +87,7 @@ def march(
         quanta = 4 if isinstance(scheme, Pairwise) and bed.rim is not None else 2
         limits = (tolerance, lax.stop_gradient(quanta / (rate * bed.spacing)))
     params: Params = (bed, around, limits) if isinstance(scheme, Schedule) else (bed, around, limits, rate)
-    return March(begin, body, done, between, params, interval)
+    return SweepLoop(begin, body, done, between, params, interval)
 
 
 def _with_momentum(bed: Bed, sand: Sand) -> State:

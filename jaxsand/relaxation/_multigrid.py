@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.relaxation._integrate import Sand, march, still
+from jaxsand.relaxation._integrate import Sand, still, sweep_loop
 from jaxsand.relaxation.flux import Nothing, Partial
 from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo, nothing_lost, rim_of, truncate
 from jaxsand.relaxation.schemes import Multilevel, schedule
@@ -38,11 +38,11 @@ def descend(
     early = schedule(scheme.steps(), limit, bound, interval, scheme.handover / 4 if level else 0.0)
     narrow = max(rows, columns) if 1 in (rows, columns) else min(rows, columns)
     if narrow < 2 * scheme.coarsest:
-        return march(bed, cells, early, tolerance, interval).run(bound // interval, sand)
+        return sweep_loop(bed, cells, early, tolerance, interval).run(bound // interval, sand)
     # Up to the first group past the handover that ends with the end of a step.
     ends = early.starts[(early.times >= scheme.handover) & (early.starts % interval == 0)]
     groups = int(ends[0]) // interval if ends.size else bound // interval
-    sand, taken = march(bed, cells, early, tolerance, interval).run(groups, sand)
+    sand, taken = sweep_loop(bed, cells, early, tolerance, interval).run(groups, sand)
 
     cut = grain(bed, sand[0])
     wide_bed, wide_cells, wide = _widen(bed, cells, cut, at(sand[0]))
@@ -57,7 +57,7 @@ def descend(
     if gone is not None and lost is not None:
         gone = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), gone, lost)
     late = schedule(scheme.steps(), limit, bound, interval)
-    sand, again = march(bed, cells, late, tolerance, interval).run(bound // interval, (u, gone))
+    sand, again = sweep_loop(bed, cells, late, tolerance, interval).run(bound // interval, (u, gone))
     return sand, taken + again + jnp.where(early_end, 0, (more + 3) // 4)
 
 

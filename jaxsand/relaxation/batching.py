@@ -16,15 +16,15 @@ import numpy as np
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.relaxation._integrate import March, Sand
+from jaxsand.relaxation._integrate import Sand, SweepLoop
 from jaxsand.relaxation.ghost_cells import Lost
 
 _CELLS = 65_536  # cells in a chunk, whose sweep then works in a core's cache
 _LEFT = 8  # a chunk stops when one in so many of its maps still moves
 
 
-def march_batch(
-    march: March,
+def loop_batch(
+    loop: SweepLoop,
     groups: int,
     enter: Callable[[jax.Array, Lost], Sand],
     judge: Callable[[jax.Array, Sand, jax.Array], Tree],
@@ -32,12 +32,12 @@ def march_batch(
     lost: Lost,
     chunk: int,
 ) -> Tree:
-    """`March.run` for every map of a batch [B, H, W], B a multiple of the chunk.
+    """`SweepLoop.run` for every map of a batch [B, H, W], B a multiple of the chunk.
 
     `enter(height, lost)` makes the sand of a map; `judge(height, sand, sweeps)` makes its result, which has a `height`.
     """
     total = height.shape[0]
-    run = partial(_together, march, groups, enter, judge)
+    run = partial(_together, loop, groups, enter, judge)
     fresh = (height, lost, jnp.zeros(total, jnp.int32), jnp.zeros(total, bool))
     chunks = jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), fresh)
     state = lax.map(lambda some: run(total > chunk, *some), chunks)
@@ -63,7 +63,7 @@ def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
 
 
 def _together(
-    march: March,
+    loop: SweepLoop,
     groups: int,
     enter: Callable[[jax.Array, Lost], Sand],
     judge: Callable[[jax.Array, Sand, jax.Array], Tree],
@@ -80,25 +80,25 @@ def _together(
     few = ready.shape[0] // _LEFT
 
     def look(k: jax.Array, moving: Tree) -> jax.Array:
-        return (k >= groups) | march.done(march.params, k, moving)
+        return (k >= groups) | loop.done(loop.params, k, moving)
 
     def goes_on(carry: Tree) -> jax.Array:
         _, _, taken, ready = carry
-        aside = others & (jnp.sum(~ready) <= few) & jnp.all(ready | jax.vmap(march.between)(taken))
+        aside = others & (jnp.sum(~ready) <= few) & jnp.all(ready | jax.vmap(loop.between)(taken))
         return ~jnp.all(ready) & ~aside
 
     def advance(carry: Tree) -> Tree:
         moving, sand, taken, ready = carry
-        moving = jax.vmap(partial(march.body, march.params))(taken, moving)
+        moving = jax.vmap(partial(loop.body, loop.params))(taken, moving)
         sand = jax.tree.map(lambda x, y: jnp.where(ready.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, moving[:2])
         taken = taken + (~ready).astype(taken.dtype)
         return moving, sand, taken, ready | jax.vmap(look)(taken, moving)
 
     sand = jax.vmap(enter)(height, lost)
-    moving = jax.vmap(march.begin)(sand)
+    moving = jax.vmap(loop.begin)(sand)
     ready = ready | jax.vmap(look)(taken, moving)
     _, sand, taken, ready = lax.while_loop(goes_on, advance, (moving, sand, taken, ready))
-    return jax.vmap(judge)(height, sand, taken * march.interval), sand[1], taken, ready
+    return jax.vmap(judge)(height, sand, taken * loop.interval), sand[1], taken, ready
 
 
 def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int | None) -> Tree:

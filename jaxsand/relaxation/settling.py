@@ -10,9 +10,9 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxsand.relaxation._integrate import March, Sand, march
+from jaxsand.relaxation._integrate import Sand, SweepLoop, sweep_loop
 from jaxsand.relaxation._multigrid import descend, start
-from jaxsand.relaxation.batching import march_batch, on_all_cores, wide_vectors
+from jaxsand.relaxation.batching import loop_batch, on_all_cores, wide_vectors
 from jaxsand.relaxation.flux import Nothing, middle, steepest, worst_excess
 from jaxsand.relaxation.ghost_cells import (
     Bed,
@@ -240,13 +240,13 @@ def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tupl
     if isinstance(scheme, Multilevel):
         tolerance = jnp.asarray(stop.tolerance)
         return descend(bed, start(scheme, at(sand[0])), scheme, stable_rate(scene), tolerance, bound, interval, sand)
-    return _march(scene, bed, scheme, stop).run(bound // interval, sand)
+    return _sweep_loop(scene, bed, scheme, stop).run(bound // interval, sand)
 
 
-def _march(scene: Scene, bed: Bed, scheme: OnOneGrid, stop: Stop) -> March:
+def _sweep_loop(scene: Scene, bed: Bed, scheme: OnOneGrid, stop: Stop) -> SweepLoop:
     bound, interval = _groups(stop)
     plan = schedule(scheme, stable_rate(scene), bound, interval) if isinstance(scheme, SuperTimeStepping) else scheme
-    return march(bed, Nothing(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
+    return sweep_loop(bed, Nothing(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
 
 
 def _groups(stop: Stop) -> tuple[int, int]:
@@ -287,9 +287,9 @@ def relax_batch(rules: tuple[Scene, Scheme, Stop, Whole | Window], height: Float
     def enter(h: jax.Array, lost: Lost) -> Sand:
         return halo(mark(scene, h)[0]), lost
 
-    way = _march(scene, bed, scheme, stop)
+    loop = _sweep_loop(scene, bed, scheme, stop)
     judge = partial(_judge, scene, bed, stop, touched=jnp.zeros((), bool))
-    return march_batch(way, bound // interval, enter, judge, height, nothing_lost(bed, height), chunk)
+    return loop_batch(loop, bound // interval, enter, judge, height, nothing_lost(bed, height), chunk)
 
 
 @cache

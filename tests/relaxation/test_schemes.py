@@ -171,8 +171,8 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
 
         return jax.lax.fori_loop(0, 12, stage, (halo(h), None, fluxes_zero(bed, halo(h))))[0]
 
-    for march in (relaxed, stepped):
-        inside, outside = (float(jnp.abs(at(march(x * best))[28:36, 28:36]).max()) for x in (0.98, 1.02))
+    for run in (relaxed, stepped):
+        inside, outside = (float(jnp.abs(at(run(x * best))[28:36, 28:36]).max()) for x in (0.98, 1.02))
         assert inside < 1 < outside
 
 
