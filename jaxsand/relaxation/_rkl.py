@@ -13,7 +13,7 @@ from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Fluxes, Nothing, Partial
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, halo
 from jaxsand.relaxation.schemes import Schedule
-from jaxsand.relaxation.sweep import Flow, surge
+from jaxsand.relaxation.sweep import Flow, rkl_stage
 
 Params: TypeAlias = tuple[Bed, Nothing | Partial, Tree]
 Pulled: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array]]  # cotangents of heights, fluxes, stable steps
@@ -21,7 +21,7 @@ State: TypeAlias = tuple[jax.Array, Lost, Fluxes]  # a map with ghost cells, its
 
 
 @dataclass(frozen=True)
-class Surges:
+class Stages:
     """A group of `interval` RKL stages of a schedule. `params` are the bed, the cells, and limits that it does not use.
 
     With 4 or 8 neighbours, a closed edge and no floor it records two bits for each link and stage, from which
@@ -38,7 +38,7 @@ class Surges:
         cut = grain(bed, state[0])
         u, lost, last = state
         state = (u, lost, tuple(m / cut for m in last))
-        u, lost, last = repeat(_SURGE, self.interval, (bed, around, rates, momenta, cut), state)
+        u, lost, last = repeat(_STAGE, self.interval, (bed, around, rates, momenta, cut), state)
         return u, lost, tuple(m * cut for m in last)
 
     def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, Tree]:
@@ -53,7 +53,7 @@ class Surges:
             word = lax.dynamic_index_in_dim(codes, i // 4, keepdims=False)
             code = flux_adjoint.active(bed, _surface(around, state[0])) << (8 * (i % 4)).astype(jnp.int32)
             codes = lax.dynamic_update_index_in_dim(codes, word | code, i // 4, 0)
-            return surge(bed, Flow(rates[i], cut), momenta[i], around, state), codes
+            return rkl_stage(bed, Flow(rates[i], cut), momenta[i], around, state), codes
 
         u, lost, last = state
         rows, columns = u.shape
@@ -154,9 +154,9 @@ def _ease(around: Nothing | Partial, change: jax.Array) -> jax.Array:
     return change if isinstance(around, Nothing) else around.surface(change)
 
 
-def _surge(params: tuple[Bed, Nothing | Partial, jax.Array, jax.Array, jax.Array], i: jax.Array, state: State) -> State:
+def _one_stage(params: tuple[Bed, Nothing | Partial, jax.Array, jax.Array, jax.Array], i: jax.Array, state: State) -> State:
     bed, around, rates, momenta, cut = params
-    return surge(bed, Flow(rates[i], cut), momenta[i], around, state)
+    return rkl_stage(bed, Flow(rates[i], cut), momenta[i], around, state)
 
 
-_SURGE = Plain(_surge)
+_STAGE = Plain(_one_stage)

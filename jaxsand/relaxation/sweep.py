@@ -47,7 +47,7 @@ def within(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"]) -> Fluxe
     return lax.optimization_barrier(no_more_than(bed.neighbours, held(h, bed.base, flow.quantum), moved))
 
 
-def surge(
+def rkl_stage(
     bed: Bed, flow: Flow, momentum: Float[Array, ""], around: Nothing | Partial, state: tuple[Ghosted, Lost, Fluxes]
 ) -> tuple[Ghosted, Lost, Fluxes]:
     """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before.

@@ -152,7 +152,7 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
     from jaxsand.relaxation.flux import Nothing, fluxes_zero
     from jaxsand.relaxation.ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.schemes import stable_rate
-    from jaxsand.relaxation.sweep import Flow, surge, sweep
+    from jaxsand.relaxation.sweep import Flow, rkl_stage, sweep
 
     i, j = np.indices((64, 64))
     h = jnp.asarray((-1.0) ** (i + j if wave == "board" else i))
@@ -167,7 +167,7 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
     @jax.jit
     def stepped(rate):
         def stage(k, state):
-            return surge(bed, Flow(rate * (2 - 1 / (k + 1)), quanta), k / (k + 1), Nothing(), state)
+            return rkl_stage(bed, Flow(rate * (2 - 1 / (k + 1)), quanta), k / (k + 1), Nothing(), state)
 
         return jax.lax.fori_loop(0, 12, stage, (halo(h), None, fluxes_zero(bed, halo(h))))[0]
 
