@@ -95,3 +95,13 @@ def test_the_code_uses_the_words_of_the_field():
     for path in PACKAGE.rglob("*.py"):
         used = {word.removesuffix("s") for word in words(ast.parse(path.read_text(encoding="utf-8")))}
         assert not used & FORBIDDEN, f"{path}: {used & FORBIDDEN}"
+
+
+def test_derivatives_of_loops_are_called_jvp_and_vjp():
+    """A push is what a tool does to the sand."""
+    for room in ("autodiff", "relaxation", "interaction"):
+        for path in (PACKAGE / room).rglob("*.py"):
+            defined = {
+                n.name for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.FunctionDef)
+            }
+            assert not defined & {"push", "pull"}, path

@@ -109,8 +109,8 @@ class _Many:
         self.tape = step.tape
         self.call = jax.vmap(step, in_axes=(axes, None, 0))
         self.recorded = jax.vmap(step.recorded, in_axes=(axes, None, 0))
-        self.push = jax.vmap(step.push, in_axes=(axes, None, 0, 0, 0))
-        self.pull = jax.vmap(step.pull, in_axes=(axes, None, 0, 0))
+        self.jvp = jax.vmap(step.jvp, in_axes=(axes, None, 0, 0, 0))
+        self.vjp = jax.vmap(step.vjp, in_axes=(axes, None, 0, 0))
 
     def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree:
         return self.call(params, k, state)
@@ -242,19 +242,19 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
     return state, loop.taken(count), tape, (places, saved)
 
 
-def push(loop: Loop, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
+def jvp(loop: Loop, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
     """The jvp of the loop: the tangent of the last state. Computes the steps again."""
 
     def one(k: jax.Array, carry: Tree) -> Tree:
         x, dx = carry
         new, record = loop.step.recorded(params, k, x)
-        dnew = loop.step.push(params, k, record, dparams, dx)
+        dnew = loop.step.jvp(params, k, record, dparams, dx)
         return loop.keep(loop.beyond(k, count), carry, (new, dnew))
 
     return lax.fori_loop(0, loop.total(count), one, (state, dstate))[1]
 
 
-def pull(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+def vjp(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
     """The vjp of the loop: the cotangents of params and of the first state, computed from the last step backwards.
 
     `tape` and `memory` are those of `record`. Records that are no longer on the tape are computed anew from the last state
@@ -262,30 +262,30 @@ def pull(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, c
     """
     total = loop.total(count)
 
-    def pull_back(first: jax.Array, end: jax.Array, tape: Tree, carry: Tree) -> Tree:
+    def backwards(first: jax.Array, end: jax.Array, tape: Tree, carry: Tree) -> Tree:
         """The cotangents before step `first`, from `carry`, those before step `end`; the tape holds the steps between."""
 
         def one(j: jax.Array, carry: Tree) -> Tree:
             # The record is part of what is carried: XLA would fetch it anew for all that uses it.
             (cf, cx), record = carry
             k = end - 1 - j
-            df, dx = loop.step.pull(params, k, record, cx)
+            df, dx = loop.step.vjp(params, k, record, cx)
             carry = loop.keep(loop.beyond(k, count), (cf, cx), (jax.tree.map(jnp.add, cf, df), dx))
             return carry, loop.get(tape, (k - 1) % loop.room)
 
         return lax.fori_loop(0, end - first, one, (carry, loop.get(tape, (end - 1) % loop.room)))[0]
 
-    floats = jax.eval_shape(loop.step.pull, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
+    floats = jax.eval_shape(loop.step.vjp, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
     carry = (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), floats), cotangent)
     if loop.bound <= loop.room:
-        return pull_back(jnp.int32(0), total, tape, carry)
+        return backwards(jnp.int32(0), total, tape, carry)
 
     def again(k: jax.Array, c: Tree) -> Tree:
         new, record = loop.step.recorded(params, k, c[0])
         return loop.keep(loop.beyond(k, count), c[0], new), loop.put(c[1], k % loop.room, record)
 
     def stretch(c: Tree) -> Tree:
-        # The steps from `end` on are pulled back; `fresh` is whether the tape still is that of the forward pass.
+        # The steps from `end` on are done; `fresh` is whether the tape still is that of the forward pass.
         end, fresh, places, saved, tape, carry = c
         before = jnp.where(places < end, places, -1)
         slot, place, free = jnp.argmax(before), jnp.max(before), jnp.argmin(places)
@@ -296,7 +296,7 @@ def pull(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, c
         saved = lax.fori_loop(0, halve.astype(jnp.int32), lambda _, saved: loop.put(saved, free, state), saved)
         places = places.at[free].set(jnp.where(halve, goal, places[free]))
         first = jnp.where(halve, end, jnp.maximum(end - loop.room, jnp.where(fresh, 0, place)))
-        carry = pull_back(first, end, tape, carry)
+        carry = backwards(first, end, tape, carry)
         return first, jnp.zeros((), bool), jnp.where(places < first, places, -1), saved, tape, carry
 
     places, saved = memory

@@ -38,10 +38,10 @@ class Step(Protocol):
     def recorded(self, params: Tree, k: jax.Array, state: Tree, /) -> tuple[Tree, Tree]:
         """The state after step k, and a record of what the derivatives of the step need."""
 
-    def push(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree, /) -> Tree:
+    def jvp(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree, /) -> Tree:
         """The jvp: the tangent of the state after step k, from those of params and of the state before."""
 
-    def pull(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree, /) -> tuple[Tree, Tree]:
+    def vjp(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree, /) -> tuple[Tree, Tree]:
         """The vjp: the cotangents of params and of the state before step k, from that of the state after."""
 
 
@@ -63,11 +63,11 @@ class Plain:
     def recorded(self, params: Tree, k: jax.Array, state: Tree) -> tuple[Tree, Tree]:
         return self.body(params, k, state), state
 
-    def push(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree) -> Tree:
+    def jvp(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree) -> Tree:
         floats, merge = split(params)
         return jax.jvp(lambda f, x: self.body(merge(f), k, x), (floats, record), (dparams, dstate))[1]
 
-    def pull(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+    def vjp(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
         floats, merge = split(params)
         return jax.vjp(lambda f, x: self.body(merge(f), k, x), floats, record)[1](cotangent)
 
@@ -149,12 +149,12 @@ def _loop_jvp(loop: Loop, primals: Tree, tangents: Tree) -> Tree:
     def forward(_: object, vector: jax.Array) -> jax.Array:
         df, dx = unravel(vector)
         params, state, *_ = shown(kept)
-        return ravel_pytree((df, _batched_while.batched(_batched_while.push, loop, params, state, count, df, dx)))[0]
+        return ravel_pytree((df, _batched_while.batched(_batched_while.jvp, loop, params, state, count, df, dx)))[0]
 
     def backward(_: object, vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
         params, _, tape, saved = shown(kept)
-        df, dx = _batched_while.batched(_batched_while.pull, loop, params, count, tape, saved, cx)
+        df, dx = _batched_while.batched(_batched_while.vjp, loop, params, count, tape, saved, cx)
         return ravel_pytree((jax.tree.map(jnp.add, cf, df), dx))[0]
 
     # The solution of "identity times x = start" by rules of our own: how JAX is told a linear map and its transpose.

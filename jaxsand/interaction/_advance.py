@@ -1,6 +1,6 @@
 """A blade moves ahead, by sub-steps; a step of a loop (while_loop.py) is several of them, within a spacing.
 
-The sub-steps ahead are pulled back in their block alone: from the block before a step its sub-steps are made again, and
+The sub-steps ahead are differentiated in their block alone: from the block before a step its sub-steps are made again, and
 each is differentiated by JAX but for the sand's coming to rest, whose derivative resting.py writes out.
 """
 
@@ -17,7 +17,7 @@ from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way, rotated
 from jaxsand.interaction._frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
-from jaxsand.interaction._resting_adjoint import Rested, blank, rest_pulled, rest_taped
+from jaxsand.interaction._resting_adjoint import Rested, blank, rest_taped, rest_vjp
 from jaxsand.interaction.resting import Links, Sand, bring_to_rest
 from jaxsand.interaction.stencil import inner, spread
 from jaxsand.relaxation.flux import Fluxes
@@ -88,11 +88,11 @@ class Step:
     def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, Any]:
         return self(way, k, sand), sand
 
-    def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
-        return Plain(self).push(way, k, record, dway, dsand)
+    def jvp(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
+        return Plain(self).jvp(way, k, record, dway, dsand)
 
-    def pull(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
-        return Plain(self).pull(way, k, record, cotangent)
+    def vjp(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
+        return Plain(self).vjp(way, k, record, cotangent)
 
 
 @dataclass(frozen=True)
@@ -246,9 +246,9 @@ class Advance(Step):
         past = jnp.where(way.rise > 0, jnp.minimum(behind, by), 0)
         return (way.bottom + (by - past) * way.rise) / way.quantum
 
-    def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
+    def jvp(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
         if isinstance(record, Moving):
-            return super().push(way, k, record, dway, dsand)
+            return super().jvp(way, k, record, dway, dsand)
         inside = _Inside(self, way, k, record)
         block = cut(inside.where, dsand.height, 0.0) / way.quantum
         flux = shifted(dsand.flux, inside.by) if self.block.follows else dsand.flux
@@ -261,12 +261,12 @@ class Advance(Step):
         height = paste(inside.where, dsand.height, block * at(inside.holds) * way.quantum)
         return Moving(height, None, flux, dsand.edge)
 
-    def pull(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
+    def vjp(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
         if isinstance(record, Moving):
-            return super().pull(way, k, record, cotangent)
+            return super().vjp(way, k, record, cotangent)
         inside = _Inside(self, way, k, record)
         gain = cut(inside.where, cotangent.height, 0.0) * way.quantum
-        of_floats, dh, dflux = inside.pull((gain, cotangent.flux))
+        of_floats, dh, dflux = inside.vjp((gain, cotangent.flux))
         height = paste(inside.where, cotangent.height, dh * at(inside.holds) / way.quantum)
         dflux = shifted_back(dflux, inside.by) if self.block.follows else dflux
         return of_floats, Moving(height, None, dflux, cotangent.edge)
@@ -304,7 +304,7 @@ class _Inside:
         h, new = bring_to_rest(ready.sand, ready.rate, self.advance.sweeps, ready.height, ready.guess)
         return h, self.advance.kept(ready.part, new, flux)
 
-    def pull(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Any, jax.Array, Fluxes]:
+    def vjp(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Any, jax.Array, Fluxes]:
         """The cotangents of the floats, the heights and the fluxes: from the last sub-step backwards, made again."""
         chunk, sweeps, floats = self.advance.chunk, self.advance.sweeps, self.floats
         rate, to_rate = jax.vjp(self.rate, floats, self.state[0])
@@ -324,14 +324,14 @@ class _Inside:
             state, of_floats, of_rate, of_state, steps = carry
             i = chunk - 1 - j
             if self.advance.block.neighbours == "isotropic":
-                pulled = jax.vjp(lambda *x: self.substep(x[0], x[1], i, *x[2:]), floats, rate, *state)[1]
-                df, dr, *of_state = pulled(of_state)
+                vjp = jax.vjp(lambda *x: self.substep(x[0], x[1], i, *x[2:]), floats, rate, *state)[1]
+                df, dr, *of_state = vjp(of_state)
             else:
-                (depends, carried), pulled, sand = jax.vjp(partial(self._depends, i), floats, rate, *state, has_aux=True)
+                (depends, carried), vjp, sand = jax.vjp(partial(self._depends, i), floats, rate, *state, has_aux=True)
                 model = Links(sand, depends.rate)
                 steps = rest_taped(model, sweeps, depends.height, depends.guess, steps)
-                rested = rest_pulled(model, sweeps, self.advance.block.part, steps, of_state)
-                df, dr, *of_state = pulled((rested, of_state[1] if carried else ()))
+                rested = rest_vjp(model, sweeps, self.advance.block.part, steps, of_state)
+                df, dr, *of_state = vjp((rested, of_state[1] if carried else ()))
             return fetched(i - 1), jax.tree.map(jnp.add, of_floats, df), of_rate + dr, tuple(of_state), steps
 
         none = jax.tree.map(jnp.zeros_like, (floats, rate))

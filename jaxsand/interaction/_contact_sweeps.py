@@ -38,14 +38,14 @@ class Beside:
     def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, State]:
         return self(params, k, state), state
 
-    def push(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
-        return Plain(self).push(params, k, record, dparams, dstate)
+    def jvp(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
+        return Plain(self).jvp(params, k, record, dparams, dstate)
 
-    def pull(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
+    def vjp(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
         bed, flow, around = params
         if not bed.by_links or not self.sweeps:
-            return Plain(self).pull(params, k, record, cotangent)
-        of = pull(bed, flow, around, surfaces(bed, flow, around, self.sweeps, record[0]), cotangent[0])
+            return Plain(self).vjp(params, k, record, cotangent)
+        of = vjp(bed, flow, around, surfaces(bed, flow, around, self.sweeps, record[0]), cotangent[0])
         dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
         daround = replace(daround, open=halo(of.open, 0.0), stretch=of.stretch, bottom=of.bottom)
         dparams = (replace(dbed, drop=of.drop), replace(dflow, rate=of.rate), daround)
@@ -53,7 +53,7 @@ class Beside:
 
 
 @dataclass(frozen=True)
-class Pulled:
+class SweepCotangents:
     """The cotangents of what some sweeps depend on: the height [H, W] before them, the tool's `open` share, `stretch` and
     `bottom`, the sweeps' `rate`, and the bed's `drop`."""
 
@@ -87,7 +87,7 @@ def _sweep(bed: Bed, flow: Flow, around: Around, h: jax.Array, lost: Lost) -> tu
 _SWEEP = Plain(lambda params, _, state: _sweep(*params, *state))
 
 
-def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.Array) -> Pulled:
+def vjp(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.Array) -> SweepCotangents:
     """The vjp of the sweeps whose surfaces are on the tape, for a cotangent [H, W] of the height after them."""
     sweeps = tape.shape[0]
     gates = [jnp.minimum(here, there) for here, there in flux_adjoint.pairs(bed, around.open)]
@@ -135,7 +135,7 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
         )
     else:
         drop = flow.rate * flux_adjoint.total(tilt[0])
-    return Pulled(
+    return SweepCotangents(
         gain,
         -flow.rate * at(flux_adjoint.to_less_open(bed, around.open, per_length)),
         moved / (1 + around.stretch),

@@ -67,7 +67,7 @@ def rest_taped(model: Links, sweeps: int, h: jax.Array, guess: Fluxes, tape: Tap
     return lax.fori_loop(0, sweeps, stage, (guess, tape))[1]
 
 
-def rest_pulled(
+def rest_vjp(
     model: Links, sweeps: int, part: Callable[[jax.Array], jax.Array], tape: Tape, cotangent: tuple[jax.Array, Fluxes]
 ) -> Rested:
     """The cotangents, from those of the heights and the fluxes in the end; `part` cuts a map to what is near the tool."""

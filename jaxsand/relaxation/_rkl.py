@@ -16,7 +16,7 @@ from jaxsand.relaxation.schemes import Schedule
 from jaxsand.relaxation.sweep import Flow, rkl_stage
 
 Params: TypeAlias = tuple[Bed, Nothing | Partial, Tree]
-Pulled: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array]]  # cotangents of heights, fluxes, stable steps
+Cotangents: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array]]  # cotangents of heights, fluxes, stable steps
 State: TypeAlias = tuple[jax.Array, Lost, Fluxes]  # a map with ghost cells, its losses, and what links moved last (m)
 
 
@@ -61,10 +61,10 @@ class Stages:
         (u, lost, last), codes = lax.fori_loop(0, self.interval, stage, ((u, lost, tuple(m / cut for m in last)), codes))
         return (u, lost, tuple(m * cut for m in last)), codes
 
-    def push(self, params: Params, k: jax.Array, record: Tree, dparams: Tree, dstate: State) -> State:
+    def jvp(self, params: Params, k: jax.Array, record: Tree, dparams: Tree, dstate: State) -> State:
         bed, around, _ = params
         if not bed.by_links:
-            return Plain(self).push(params, k, record, dparams, dstate)
+            return Plain(self).jvp(params, k, record, dparams, dstate)
         rates, momenta = self._stages(k, dstate[0].dtype)
         dbed = split(params)[1](dparams)[0]
         weights = flux_adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
@@ -87,16 +87,16 @@ class Stages:
         dh, last = lax.fori_loop(0, self.interval, stage, (at(dstate[0]), last))
         return halo(dh, 0.0), None, flux_adjoint.from_lattice(bed, last)
 
-    def pull(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
+    def vjp(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
         bed, around, _ = params
         if not bed.by_links:
-            return Plain(self).pull(params, k, record, cotangent)
+            return Plain(self).vjp(params, k, record, cotangent)
         rates, momenta = self._stages(k, cotangent[0].dtype)
         weights = flux_adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
         lengths = flux_adjoint.opened(bed, None)
         stretch = weights if bed.drop.ndim else [w / v for w, v in zip(weights, lengths, strict=True)]
 
-        def stage(j: jax.Array, carry: Pulled) -> Pulled:
+        def stage(j: jax.Array, carry: Cotangents) -> Cotangents:
             i = self.interval - 1 - j
             gain, last, tilt = carry
             again = jnp.where(j > 0, momenta[jnp.minimum(i + 1, self.interval - 1)], 1)

@@ -84,7 +84,7 @@ class Sweep(Plain):
     def __init__(self) -> None:
         super().__init__(lambda params, _, state: sweep(*params, *state))
 
-    def pull(
+    def vjp(
         self,
         params: tuple[Bed, Flow, Nothing | Partial],
         k: jax.Array,
@@ -94,7 +94,7 @@ class Sweep(Plain):
         """The vjp, with 4 or 8 neighbours, a closed edge and no floor by the formulas of flux_adjoint.py, else by JAX."""
         bed, flow, around = params
         if not bed.by_links:
-            return super().pull(params, k, record, cotangent)
+            return super().vjp(params, k, record, cotangent)
         h, gain = at(record[0]), at(cotangent[0])
         s = record[0] if isinstance(around, Nothing) else halo(around.surface(h))
         gate = None if isinstance(around, Nothing) else around.open
@@ -103,9 +103,9 @@ class Sweep(Plain):
         onward, of_yield, of_rate = [], [], []
         for step, most, w, y in zip(d, m, weights, back, strict=True):
             up, down = step > most, step < -most
-            pulled = flow.rate * w * y
-            onward.append(jnp.where(up | down, pulled, 0))
-            of_yield.append(jnp.where(up, pulled, jnp.where(down, -pulled, 0)))
+            passed = flow.rate * w * y
+            onward.append(jnp.where(up | down, passed, 0))
+            of_yield.append(jnp.where(up, passed, jnp.where(down, -passed, 0)))
             excess = jnp.where(up, step - most, jnp.where(down, step + most, 0)) * y
             of_rate.append(excess * w)
         slope = flux_adjoint.gains(bed, lax.optimization_barrier(tuple(onward)))
