@@ -15,7 +15,7 @@ import numpy as np
 from jaxsand.bench.rivals.plain import settle_numpy
 from jaxsand.bench.timing import seconds_of, timed
 from jaxsand.bench.work_precision import COLUMN, RIDGE, distance, trench
-from jaxsand.relaxation.flux import Nothing
+from jaxsand.relaxation.flux import WholeCells
 from jaxsand.relaxation.ghost_cells import at, halo, largest, prepare, quantum
 from jaxsand.relaxation.schemes import Relaxation
 from jaxsand.relaxation.settling import relax, settle, settle_batch
@@ -74,7 +74,7 @@ def activity(n: int = 160, sweeps: int = 1000) -> dict[str, Any]:
     flow = Flow(jnp.float32(0.125), quantum(largest(h)))
 
     def one(u: jax.Array, _: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        after = sweep(bed, flow, Nothing(), u, None)[0]
+        after = sweep(bed, flow, WholeCells(), u, None)[0]
         moved = jnp.abs(at(after) - at(u)) > 1e-3 * bed.drop
         sides = [jnp.any(moved, axis=axis) for axis in (0, 1)]
         spans = [jnp.max(jnp.where(s, jnp.arange(n), -1)) - jnp.min(jnp.where(s, jnp.arange(n), n)) + 3 for s in sides]

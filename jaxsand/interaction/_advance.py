@@ -15,7 +15,7 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way, rotated
+from jaxsand.interaction._block import Block, First, Moving, Openness, View, Way, rotated
 from jaxsand.interaction._frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
 from jaxsand.interaction._resting_adjoint import Rested, blank, rest_taped, rest_vjp
 from jaxsand.interaction.resting import Links, Sand, bring_to_rest
@@ -26,7 +26,7 @@ from jaxsand.relaxation.ghost_cells import Lost, at, halo
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 
 
-State = tuple[jax.Array, Fluxes, Stand]  # heights, fluxes, and how sand stood last in the block
+State = tuple[jax.Array, Fluxes, Openness]  # heights, fluxes, and how sand stood last in the block
 
 
 @jax.tree_util.register_dataclass
@@ -36,7 +36,7 @@ class Ready:
     or a map near the blade), at which rate sand flows, its heights, a guess of what flows, and which share of a whole
     sub-step this one is."""
 
-    near: Stand
+    near: Openness
     bottom: jax.Array
     sand: Sand
     rate: jax.Array
@@ -44,8 +44,8 @@ class Ready:
     guess: Fluxes
     part: jax.Array
 
-    def stand(self) -> Stand:
-        return Stand(self.sand.gates, self.sand.open, self.sand.stretch)
+    def openness(self) -> Openness:
+        return Openness(self.sand.gates, self.sand.open, self.sand.stretch)
 
 
 @jax.tree_util.register_dataclass
@@ -134,7 +134,7 @@ class Advance(Step):
             h, new = self.rest(ready.sand, ready.rate, self.sweeps, ready.height, ready.guess)
             if gone is not None and lost is not None:
                 gone = gone + lost + new[-1]
-            return (h, self.kept(ready.part, new, flux), ready.stand()), gone, scooped
+            return (h, self.kept(ready.part, new, flux), ready.openness()), gone, scooped
 
         state = (old, flux, self.block.clear(view))
         (new, after, _), gone, scooped = lax.fori_loop(0, self.chunk, substep, (state, gone, sand.scooped))
@@ -225,10 +225,10 @@ class Advance(Step):
             repose = jnp.arctan(self.block.part(jnp.broadcast_to(view.drop, h.shape)) * (way.quantum / way.spacing))
             shares = blade.slid(cos, sin, spread(frame.mirrors(way.yaw), taken), repose)
         h, lost = self.block.displaced(way, view, shares, h, taken)
-        around = self.block.around(view, cut.reach)
-        sand = self.block.sand(way, view, clear, around)
-        guess = self.block.guess(around.gates, jnp.where(cut.moving, cut.part, 0), flux)
-        return Ready(around, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
+        near = self.block.beside(view, cut.reach)
+        sand = self.block.sand(way, view, clear, near)
+        guess = self.block.guess(near.gates, jnp.where(cut.moving, cut.part, 0), flux)
+        return Ready(near, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
 
     def bottom(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
         """The blade's bottom over each cell near it (quanta), when it has moved by a length (spacings).

@@ -115,7 +115,7 @@ class View:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Stand:
+class Openness:
     """How sand stands around a tool: the open share of links (`gates`) and of cells (`open`), and how much higher sand
     stands in partly covered cells (`stretch`); see resting.py."""
 
@@ -247,18 +247,18 @@ class Block:
         change = jnp.where(covered, jnp.inf, jnp.abs(new - old) * (way.quantum / way.spacing))
         return lax.stop_gradient(jnp.max(jnp.where(near, change, 0), axis=(0, 1)))
 
-    def clear(self, view: View) -> Stand:
+    def clear(self, view: View) -> Openness:
         """How sand stands in the block where no blade is."""
         gates = tuple(here * there for here, there in both_ends(self.neighbours, view.holds))
-        return Stand(gates, at(view.holds), jnp.zeros_like(at(view.holds)))
+        return Openness(gates, at(view.holds), jnp.zeros_like(at(view.holds)))
 
-    def around(self, view: View, reach: blade.Reach) -> Stand:
+    def beside(self, view: View, reach: blade.Reach) -> Openness:
         """How sand stands in the inner part, around a blade."""
         free, gates = blade.gates(self.neighbours, reach, self.part(view.holds))
         free = inner(free)
-        return Stand(gates, free, (1 - free) / jnp.maximum(free, blade.SLIVER) * at(self.part(view.holds)))
+        return Openness(gates, free, (1 - free) / jnp.maximum(free, blade.SLIVER) * at(self.part(view.holds)))
 
-    def sand(self, way: Way, view: View, clear: Stand, near: Stand) -> Sand:
+    def sand(self, way: Way, view: View, clear: Openness, near: Openness) -> Sand:
         """The sand of the block: `clear` gives how it stands without a blade, and `near` how in the inner part."""
         stand = jax.tree.map(self.put, clear, near)
         rim = None if way.level is None else way.level / way.quantum

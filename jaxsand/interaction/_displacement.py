@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import repeat
 from jaxsand.interaction._contact_sweeps import Beside
-from jaxsand.relaxation.flux import stand
+from jaxsand.relaxation.flux import tool_in_sand
 from jaxsand.relaxation.ghost_cells import Bed, Lost, truncate
 from jaxsand.relaxation.sweep import Flow
 
@@ -78,7 +78,7 @@ def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
 
 def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
     """The height and the losses after some sweeps of the sand around a blade whose footprint is `cover`."""
-    return repeat(Beside(sweeps), 1, (job.bed, flow, stand(cover, job.bottom)), (h, lost))
+    return repeat(Beside(sweeps), 1, (job.bed, flow, tool_in_sand(cover, job.bottom)), (h, lost))
 
 
 def whole(job: Job, amount: jax.Array) -> jax.Array:

@@ -13,7 +13,7 @@ from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import Step
 from jaxsand.interaction._block import Block, Moving, View, pose_ahead, rotated
 from jaxsand.interaction._frame import Frame, frame_of, shifted
-from jaxsand.interaction._wheel import Stand, Track
+from jaxsand.interaction._wheel import Placed, Track
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import at, truncate
@@ -41,7 +41,7 @@ class Touchdown(_OfWheel):
         way, frame = track.way, frame_of(self.block.shape, track.way.start)
         first = self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
-        here = wheel.stand(self.block, track, frame, first, view)
+        here = wheel.placed(self.block, track, frame, first, view)
         taken = truncate(here.cover * jnp.maximum(old - here.rim, 0)) * at(view.holds)
         gone = None if view.beyond is None else jnp.zeros_like(old)
         onward = Plain(_Onward(self.block), 16)
@@ -59,7 +59,7 @@ class _Onward:
 
     block: Block
 
-    def __call__(self, params: tuple[Track, View, wheel.Shares, Stand], k: jax.Array, state: Carried) -> Carried:
+    def __call__(self, params: tuple[Track, View, wheel.Shares, Placed], k: jax.Array, state: Carried) -> Carried:
         track, view, shares, here = params
         return wheel.handed_on(self.block, track, view, shares, here, state)
 
@@ -81,7 +81,7 @@ class _Moved(_OfWheel):
         track: Track,
         view: View,
         shares: wheel.Shares,
-        now: Stand,
+        now: Placed,
         part: jax.Array,
         h: jax.Array,
         flux: Fluxes,
@@ -89,9 +89,9 @@ class _Moved(_OfWheel):
     ) -> Sanded:
         """The sand after what was taken up has left the wheel's new place `now`, and was brought to rest around it."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
-        around, among = wheel.around(self.block, track, view, now, h)
-        guess = self.block.guess(around.gates, among * part, flux)
-        h, new = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
+        beside, among = wheel.sand_beside(self.block, track, view, now, h)
+        guess = self.block.guess(beside.gates, among * part, flux)
+        h, new = bring_to_rest(beside, track.way.rate * among * part, self.sweeps, h, guess)
         return h, self.kept(part, new, flux), None if gone is None else gone + new[-1]
 
 
@@ -118,7 +118,7 @@ class Turn(_Moved):
         after = replace(frame, pose=rotated(way.start, sign * (begin + ahead)))
         first = self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
-        before, now = (wheel.stand(self.block, track, f, first, view) for f in (frame, after))
+        before, now = (wheel.placed(self.block, track, f, first, view) for f in (frame, after))
         taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, old), 0) * at(view.holds)
         shares = wheel.turning(track, frame, before, sign)
         new, flux, gone = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
@@ -153,7 +153,7 @@ class Roll(_Moved):
         def substep(i: jax.Array, state: Sanded) -> Sanded:
             h, flux, gone = state
             (begin, end), ahead = self._ends(track, k, i)
-            before, now = (wheel.stand(block, track.at(by), _at(frame, by), first, view) for by in (begin, end))
+            before, now = (wheel.placed(block, track.at(by), _at(frame, by), first, view) for by in (begin, end))
             taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, h), 0) * at(view.holds)
             h, left = wheel.carried_back(block, track, _at(frame, end), first, view, ahead, h, taken)
             h = h - taken + left
@@ -166,7 +166,7 @@ class Roll(_Moved):
 
         new, flux, gone = lax.fori_loop(0, self.chunk, substep, (old, flux, gone))
         ends = self._ends(track, k, jnp.int32(0))[0][0], self._ends(track, k, jnp.int32(self.chunk - 1))[0][1]
-        cover = jnp.maximum(*(wheel.stand(block, track, _at(frame, by), first, view).cover for by in ends))
+        cover = jnp.maximum(*(wheel.placed(block, track, _at(frame, by), first, view).cover for by in ends))
         edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, new, cover))
         return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
 

@@ -12,7 +12,7 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
 from jaxsand.relaxation._rkl import Stages
-from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, fluxes_zero, link_flux, worst_excess
+from jaxsand.relaxation.flux import Cells, Fluxes, WholeCells, fluxes, fluxes_zero, link_flux, worst_excess
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, truncate
 from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.relaxation.sweep import Flow, Sweep, apply, within
@@ -22,8 +22,8 @@ Sand: TypeAlias = tuple[jax.Array, Lost]  # a map with ghost cells, and what it 
 State: TypeAlias = Sand | tuple[jax.Array, Lost, Fluxes]
 Rate: TypeAlias = jax.Array | float
 Limits: TypeAlias = tuple[jax.Array, jax.Array]  # see `still`
-Params: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, *tuple[Rate, ...]]
-Swept: TypeAlias = tuple[Bed, Nothing | Partial, Limits | None, Rate]
+Params: TypeAlias = tuple[Bed, Cells, Limits | None, *tuple[Rate, ...]]
+Swept: TypeAlias = tuple[Bed, Cells, Limits | None, Rate]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class SweepLoop:
 
 def sweep_loop(
     bed: Bed,
-    around: Nothing | Partial,
+    cells: Cells,
     scheme: Relaxation | Pairwise | Schedule,
     tolerance: jax.Array | None,
     interval: int,
@@ -86,7 +86,7 @@ def sweep_loop(
     else:  # over the rim flows at least 1/2 of rate * excess * spacing (`Pairwise`: 1/4), over links all of it
         quanta = 4 if isinstance(scheme, Pairwise) and bed.rim is not None else 2
         limits = (tolerance, lax.stop_gradient(quanta / (rate * bed.spacing)))
-    params: Params = (bed, around, limits) if isinstance(scheme, Schedule) else (bed, around, limits, rate)
+    params: Params = (bed, cells, limits) if isinstance(scheme, Schedule) else (bed, cells, limits, rate)
     return SweepLoop(begin, body, done, between, params, interval)
 
 
@@ -102,7 +102,7 @@ def _always(k: jax.Array) -> jax.Array:
     return jnp.ones((), bool)
 
 
-def still(bed: Bed, around: Nothing | Partial, limits: Limits, u: jax.Array) -> jax.Array:
+def still(bed: Bed, cells: Cells, limits: Limits, u: jax.Array) -> jax.Array:
     """Whether no slope of a map with ghost cells exceeds repose by more than floats can still move, or than the tolerance.
 
     The limits are the tolerance (a tangent) and, per quantum (1/m), the excess slope below which fluxes may be cut to 0.
@@ -110,20 +110,20 @@ def still(bed: Bed, around: Nothing | Partial, limits: Limits, u: jax.Array) -> 
     tolerance, floor = limits
     if bed.neighbours == "isotropic":  # the larger component of a gradient moves at least 1/(4 sqrt(2)) of its excess
         floor = 3 * floor
-    return worst_excess(bed, u, around) <= jnp.maximum(tolerance, floor * grain(bed, u))
+    return worst_excess(bed, u, cells) <= jnp.maximum(tolerance, floor * grain(bed, u))
 
 
 def _never(params: Params, k: jax.Array, state: State) -> jax.Array:
     return jnp.zeros((), bool)
 
 
-def _still(params: tuple[Bed, Nothing | Partial, Limits, *tuple[Rate, ...]], k: jax.Array, state: State) -> jax.Array:
-    bed, around, limits = params[:3]
-    return still(bed, around, limits, state[0])
+def _still(params: tuple[Bed, Cells, Limits, *tuple[Rate, ...]], k: jax.Array, state: State) -> jax.Array:
+    bed, cells, limits = params[:3]
+    return still(bed, cells, limits, state[0])
 
 
 def _still_after_a_step(
-    plan: Schedule, interval: int, params: tuple[Bed, Nothing | Partial, Limits], k: jax.Array, state: State
+    plan: Schedule, interval: int, params: tuple[Bed, Cells, Limits], k: jax.Array, state: State
 ) -> jax.Array:
     return _between_steps(plan, interval, k) & _still(params, k, state)
 
@@ -133,9 +133,9 @@ def _between_steps(plan: Schedule, interval: int, k: jax.Array) -> jax.Array:
 
 
 def _sweeps(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
-    bed, around, _, rate = params
+    bed, cells, _, rate = params
     flow = Flow(jnp.asarray(rate), grain(bed, state[0]))
-    return repeat(Sweep(), interval, (bed, flow, around), state)
+    return repeat(Sweep(), interval, (bed, flow, cells), state)
 
 
 def _pairs(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
@@ -157,7 +157,7 @@ def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
             u, lost = apply(bed, flow, within(bed, flow, tuple(moved), at(u)), u, lost)
     if bed.rim is None:
         return u, lost
-    drain = truncate(fluxes(bed, Nothing(), u)[-1] * (scale / 2))  # a cell has up to four sides
+    drain = truncate(fluxes(bed, WholeCells(), u)[-1] * (scale / 2))  # a cell has up to four sides
     return apply(bed, flow, within(bed, flow, (*fluxes_zero(bed, u)[:-1], drain), at(u)), u, lost)
 
 

@@ -1,7 +1,7 @@
 """Multigrid settling; see `Multilevel`.
 
 On every grid a map holds volume per cell area, in whole quanta, so that volume is exact. Where the number of rows or columns
-is odd, the last coarse cells contain sand in a part of their area only (`Partial`).
+is odd, the last coarse cells contain sand in a part of their area only (`PartialCells`).
 """
 
 from dataclasses import replace
@@ -12,11 +12,9 @@ import numpy as np
 from jax import lax
 
 from jaxsand.relaxation._integrate import Sand, still, sweep_loop
-from jaxsand.relaxation.flux import Nothing, Partial
+from jaxsand.relaxation.flux import Cells, PartialCells, WholeCells
 from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo, nothing_lost, rim_of, truncate
 from jaxsand.relaxation.schemes import Multilevel, schedule
-
-Cells = Nothing | Partial
 
 
 def descend(
@@ -65,8 +63,8 @@ def _widen(bed: Bed, cells: Cells, cut: jax.Array, volume: jax.Array) -> tuple[B
     """The bed, the cells and the volume [H/2, W/2] of the next coarser grid."""
     wide = _sum(_quarters(volume)) / 4  # NaN where any of the four is: no sand passes through a wall
     wide_cells: Cells = cells
-    if isinstance(cells, Partial):
-        wide_cells = Partial(halo(_sum(_quarters(at(cells.open))) / 4, 0.0))
+    if isinstance(cells, PartialCells):
+        wide_cells = PartialCells(halo(_sum(_quarters(at(cells.open))) / 4, 0.0))
     wide = truncate(wide / cut) * cut
     drop = bed.drop * 2
     if bed.drop.ndim:
@@ -98,7 +96,7 @@ def _spread(cells: Cells, cut: jax.Array, change: jax.Array, volume: jax.Array) 
     """
     rows, columns = volume.shape
     whole_cell = ~jnp.isnan(volume)
-    if isinstance(cells, Nothing):
+    if isinstance(cells, WholeCells):
         fine = _inject(change, volume.shape)
     else:
         parts = _quarters(at(cells.open))
@@ -126,10 +124,10 @@ def _spread(cells: Cells, cut: jax.Array, change: jax.Array, volume: jax.Array) 
 
 
 def start(scheme: Multilevel, marked: jax.Array) -> Cells:
-    """The cells of the finest grid: `Nothing` if each cell of every grid consists of four finer ones, else `Partial`."""
+    """The cells of the finest grid, whole if each cell of every grid consists of four finer ones."""
     rows, columns = marked.shape
     odd = 1 in marked.shape
     while min(rows, columns) >= 2 * scheme.coarsest:
         odd = odd or rows % 2 == 1 or columns % 2 == 1
         rows, columns = rows // 2, columns // 2
-    return Partial(halo(jnp.ones_like(marked), 0.0)) if odd else Nothing()
+    return PartialCells(halo(jnp.ones_like(marked), 0.0)) if odd else WholeCells()

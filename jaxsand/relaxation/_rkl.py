@@ -10,12 +10,12 @@ from jax.typing import DTypeLike
 
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
-from jaxsand.relaxation.flux import Fluxes, Nothing, Partial
+from jaxsand.relaxation.flux import Cells, Fluxes, WholeCells
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, halo
 from jaxsand.relaxation.schemes import Schedule
 from jaxsand.relaxation.sweep import Flow, rkl_stage
 
-Params: TypeAlias = tuple[Bed, Nothing | Partial, Tree]
+Params: TypeAlias = tuple[Bed, Cells, Tree]
 Cotangents: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array]]  # cotangents of heights, fluxes, stable steps
 State: TypeAlias = tuple[jax.Array, Lost, Fluxes]  # a map with ghost cells, its losses, and what links moved last (m)
 
@@ -33,16 +33,16 @@ class Stages:
     tape: int = 16
 
     def __call__(self, params: Params, k: jax.Array, state: State) -> State:
-        bed, around, _ = params
+        bed, cells, _ = params
         rates, momenta = self._stages(k, state[0].dtype)
         cut = grain(bed, state[0])
         u, lost, last = state
         state = (u, lost, tuple(m / cut for m in last))
-        u, lost, last = repeat(_STAGE, self.interval, (bed, around, rates, momenta, cut), state)
+        u, lost, last = repeat(_STAGE, self.interval, (bed, cells, rates, momenta, cut), state)
         return u, lost, tuple(m * cut for m in last)
 
     def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, Tree]:
-        bed, around, _ = params
+        bed, cells, _ = params
         if not bed.by_links:
             return Plain(self).recorded(params, k, state)
         rates, momenta = self._stages(k, state[0].dtype)
@@ -51,9 +51,9 @@ class Stages:
         def stage(i: jax.Array, carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
             state, codes = carry
             word = lax.dynamic_index_in_dim(codes, i // 4, keepdims=False)
-            code = flux_adjoint.active(bed, _surface(around, state[0])) << (8 * (i % 4)).astype(jnp.int32)
+            code = flux_adjoint.active(bed, _surface(cells, state[0])) << (8 * (i % 4)).astype(jnp.int32)
             codes = lax.dynamic_update_index_in_dim(codes, word | code, i // 4, 0)
-            return rkl_stage(bed, Flow(rates[i], cut), momenta[i], around, state), codes
+            return rkl_stage(bed, Flow(rates[i], cut), momenta[i], cells, state), codes
 
         u, lost, last = state
         rows, columns = u.shape
@@ -62,19 +62,19 @@ class Stages:
         return (u, lost, tuple(m * cut for m in last)), codes
 
     def jvp(self, params: Params, k: jax.Array, record: Tree, dparams: Tree, dstate: State) -> State:
-        bed, around, _ = params
+        bed, cells, _ = params
         if not bed.by_links:
             return Plain(self).jvp(params, k, record, dparams, dstate)
         rates, momenta = self._stages(k, dstate[0].dtype)
         dbed = split(params)[1](dparams)[0]
-        weights = flux_adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
+        weights = flux_adjoint.opened(bed, None if isinstance(cells, WholeCells) else cells.open)
         dyields = jax.jvp(lambda drop: flux_adjoint.yields(replace(bed, drop=drop)), (bed.drop,), (dbed.drop,))[1]
 
         def stage(i: jax.Array, carry: tuple[jax.Array, Fluxes]) -> tuple[jax.Array, Fluxes]:
             dh, last = carry
             code, moved = _code(record, i), []
             for n, (step, dm, w) in enumerate(
-                zip(flux_adjoint.steps(bed, halo(_ease(around, dh), 0.0)), dyields, weights, strict=True)
+                zip(flux_adjoint.steps(bed, halo(_ease(cells, dh), 0.0)), dyields, weights, strict=True)
             ):
                 beyond = jnp.where(
                     flux_adjoint.upward(code, n), step - dm, jnp.where(flux_adjoint.downward(code, n), step + dm, 0)
@@ -88,11 +88,11 @@ class Stages:
         return halo(dh, 0.0), None, flux_adjoint.from_lattice(bed, last)
 
     def vjp(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
-        bed, around, _ = params
+        bed, cells, _ = params
         if not bed.by_links:
             return Plain(self).vjp(params, k, record, cotangent)
         rates, momenta = self._stages(k, cotangent[0].dtype)
-        weights = flux_adjoint.opened(bed, None if isinstance(around, Nothing) else around.open)
+        weights = flux_adjoint.opened(bed, None if isinstance(cells, WholeCells) else cells.open)
         lengths = flux_adjoint.opened(bed, None)
         stretch = weights if bed.drop.ndim else [w / v for w, v in zip(weights, lengths, strict=True)]
 
@@ -114,7 +114,7 @@ class Stages:
             if not bed.drop.ndim:
                 signed = [jnp.asarray(sum(signed))]
             tilt = [t + rate * s for t, s in zip(tilt, signed, strict=True)]
-            return gain + rate * _ease(around, flux_adjoint.gains(bed, tuple(onward))), back, tilt
+            return gain + rate * _ease(cells, flux_adjoint.gains(bed, tuple(onward))), back, tilt
 
         gain = at(cotangent[0])
         last = [-p for p in flux_adjoint.to_lattice(bed, cotangent[2])]
@@ -144,19 +144,19 @@ def _code(codes: jax.Array, i: jax.Array) -> jax.Array:
     return lax.shift_right_logical(word, jnp.full(word.shape, shift, word.dtype))
 
 
-def _surface(around: Nothing | Partial, u: jax.Array) -> jax.Array:
+def _surface(cells: Cells, u: jax.Array) -> jax.Array:
     """The height of the surface for a map of volumes per cell area, both with ghost cells."""
-    return u if isinstance(around, Nothing) else halo(around.surface(at(u)))
+    return u if isinstance(cells, WholeCells) else halo(cells.surface(at(u)))
 
 
-def _ease(around: Nothing | Partial, change: jax.Array) -> jax.Array:
+def _ease(cells: Cells, change: jax.Array) -> jax.Array:
     """The change of the surface for a change of the volume per cell area; a diagonal linear map, its own transpose."""
-    return change if isinstance(around, Nothing) else around.surface(change)
+    return change if isinstance(cells, WholeCells) else cells.surface(change)
 
 
-def _one_stage(params: tuple[Bed, Nothing | Partial, jax.Array, jax.Array, jax.Array], i: jax.Array, state: State) -> State:
-    bed, around, rates, momenta, cut = params
-    return rkl_stage(bed, Flow(rates[i], cut), momenta[i], around, state)
+def _one_stage(params: tuple[Bed, Cells, jax.Array, jax.Array, jax.Array], i: jax.Array, state: State) -> State:
+    bed, cells, rates, momenta, cut = params
+    return rkl_stage(bed, Flow(rates[i], cut), momenta[i], cells, state)
 
 
 _STAGE = Plain(_one_stage)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from jaxsand.relaxation._integrate import Sand, SweepLoop, sweep_loop
 from jaxsand.relaxation._multigrid import descend, start
 from jaxsand.relaxation.batching import loop_batch, on_all_cores, wide_vectors
-from jaxsand.relaxation.flux import Nothing, middle, steepest, worst_excess
+from jaxsand.relaxation.flux import WholeCells, middle, steepest, worst_excess
 from jaxsand.relaxation.ghost_cells import (
     Bed,
     Lost,
@@ -246,7 +246,7 @@ def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tupl
 def _sweep_loop(scene: Scene, bed: Bed, scheme: OnOneGrid, stop: Stop) -> SweepLoop:
     bound, interval = _groups(stop)
     plan = schedule(scheme, stable_rate(scene), bound, interval) if isinstance(scheme, SuperTimeStepping) else scheme
-    return sweep_loop(bed, Nothing(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
+    return sweep_loop(bed, WholeCells(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
 
 
 def _groups(stop: Stop) -> tuple[int, int]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Plain, Tree, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.floor import held, no_more_than
-from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
+from jaxsand.relaxation.flux import Cells, Fluxes, PartialCells, WholeCells, fluxes, gained
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
 
 Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
@@ -25,12 +25,12 @@ class Flow:
     quantum: Float[Array, ""]
 
 
-def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
+def sweep(bed: Bed, flow: Flow, cells: Cells, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
     """One sweep of a map with ghost cells [H + 2, W + 2], by forward Euler.
 
     `lost` adds up the height that each cell lost over a draining rim (see `lose`); it is None where the edge is closed.
     """
-    moved = within(bed, flow, counted(flow, fluxes(bed, around, u)), at(u))
+    moved = within(bed, flow, counted(flow, fluxes(bed, cells, u)), at(u))
     return apply(bed, flow, moved, u, lost)
 
 
@@ -48,7 +48,7 @@ def within(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"]) -> Fluxe
 
 
 def rkl_stage(
-    bed: Bed, flow: Flow, momentum: Float[Array, ""], around: Nothing | Partial, state: tuple[Ghosted, Lost, Fluxes]
+    bed: Bed, flow: Flow, momentum: Float[Array, ""], cells: Cells, state: tuple[Ghosted, Lost, Fluxes]
 ) -> tuple[Ghosted, Lost, Fluxes]:
     """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before.
 
@@ -56,7 +56,7 @@ def rkl_stage(
     """
     u, lost, last = state
     scale = flow.rate / flow.quantum
-    moved = tuple(truncate(f * scale) + truncate(m * momentum) for f, m in zip(fluxes(bed, around, u), last, strict=True))
+    moved = tuple(truncate(f * scale) + truncate(m * momentum) for f, m in zip(fluxes(bed, cells, u), last, strict=True))
     moved = within(bed, flow, lax.optimization_barrier(moved), at(u))
     u, lost = apply(bed, flow, moved, u, lost)
     return u, lost, moved
@@ -86,18 +86,18 @@ class Sweep(Plain):
 
     def vjp(
         self,
-        params: tuple[Bed, Flow, Nothing | Partial],
+        params: tuple[Bed, Flow, Cells],
         k: jax.Array,
         record: tuple[jax.Array, Lost],
         cotangent: tuple[jax.Array, Lost],
     ) -> tuple[Tree, tuple[jax.Array, Lost]]:
         """The vjp, with 4 or 8 neighbours, a closed edge and no floor by the formulas of flux_adjoint.py, else by JAX."""
-        bed, flow, around = params
+        bed, flow, cells = params
         if not bed.by_links:
             return super().vjp(params, k, record, cotangent)
         h, gain = at(record[0]), at(cotangent[0])
-        s = record[0] if isinstance(around, Nothing) else halo(around.surface(h))
-        gate = None if isinstance(around, Nothing) else around.open
+        s = record[0] if isinstance(cells, WholeCells) else halo(cells.surface(h))
+        gate = None if isinstance(cells, WholeCells) else cells.open
         d, m, weights = flux_adjoint.steps(bed, s), flux_adjoint.yields(bed), flux_adjoint.opened(bed, gate)
         back = flux_adjoint.steps(bed, halo(gain, 0.0))
         onward, of_yield, of_rate = [], [], []
@@ -109,10 +109,10 @@ class Sweep(Plain):
             excess = jnp.where(up, step - most, jnp.where(down, step + most, 0)) * y
             of_rate.append(excess * w)
         slope = flux_adjoint.gains(bed, lax.optimization_barrier(tuple(onward)))
-        dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
+        dbed, dflow, dcells = jax.tree.map(jnp.zeros_like, params)
         dbed = replace(dbed, drop=flux_adjoint.drop_cotangent(bed, of_yield))
         dflow = replace(dflow, rate=-jnp.sum(sum(of_rate)))
-        if isinstance(around, Partial):
-            share = at(around.open)
+        if isinstance(cells, PartialCells):
+            share = at(cells.open)
             slope = slope / jnp.where(share > 0, share, 1)
-        return split((dbed, dflow, daround))[0], (halo(gain + slope, 0.0), None)
+        return split((dbed, dflow, dcells))[0], (halo(gain + slope, 0.0), None)

@@ -149,7 +149,7 @@ def test_pairwise_is_quick_and_unfaithful_but_approaches_the_limit_with_its_shar
 @pytest.mark.parametrize(("neighbours", "wave"), [(4, "board"), (8, "stripes"), ("isotropic", "board")])
 def test_stable_ranges_within_two_per_cent(neighbours, wave):
     """The fastest-growing mode, on sand that yields everywhere, shrinks just inside the range and grows just outside."""
-    from jaxsand.relaxation.flux import Nothing, fluxes_zero
+    from jaxsand.relaxation.flux import WholeCells, fluxes_zero
     from jaxsand.relaxation.ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.schemes import stable_rate
     from jaxsand.relaxation.sweep import Flow, rkl_stage, sweep
@@ -162,12 +162,12 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
 
     @jax.jit
     def relaxed(rate):
-        return jax.lax.fori_loop(0, 12, lambda _, u: sweep(bed, Flow(rate, quanta), Nothing(), u, None)[0], halo(h))
+        return jax.lax.fori_loop(0, 12, lambda _, u: sweep(bed, Flow(rate, quanta), WholeCells(), u, None)[0], halo(h))
 
     @jax.jit
     def stepped(rate):
         def stage(k, state):
-            return rkl_stage(bed, Flow(rate * (2 - 1 / (k + 1)), quanta), k / (k + 1), Nothing(), state)
+            return rkl_stage(bed, Flow(rate * (2 - 1 / (k + 1)), quanta), k / (k + 1), WholeCells(), state)
 
         return jax.lax.fori_loop(0, 12, stage, (halo(h), None, fluxes_zero(bed, halo(h))))[0]
 
