@@ -32,7 +32,7 @@ _UNITS = (SPACING, SPACING, 1.0)
 
 
 @dataclass(frozen=True)
-class Case:
+class GradientCase:
     """A program whose gradient is wanted: settling, or a push by a tool and settling; of a bucket, a scoop and a dump.
 
     `rises`: strokes have heights. `base`: what lies under the sand.
@@ -69,7 +69,7 @@ class Case:
         return way + (", at an angle" if yaw is not None else "") + (", plates" if plates is not None else "")
 
 
-def program(case: Case, cells: int) -> Callable[..., Any]:
+def program(case: GradientCase, cells: int) -> Callable[..., Any]:
     """From a height [H, W], stroke, angle, and perhaps a stop rule: a weighted sum of the map that is left, and the sweeps
     that settling took."""
     weights = np.random.default_rng(9).standard_normal((cells, cells))
@@ -106,7 +106,7 @@ def sloped(run: Callable[..., Any]) -> Callable[..., Any]:
     return jax.value_and_grad(run, (0, 1, 2), has_aux=True)
 
 
-def inputs(case: Case, cells: int, batch: int, seed: int = 0) -> Inputs:
+def inputs(case: GradientCase, cells: int, batch: int, seed: int = 0) -> Inputs:
     """Random strokes, in a square of 0.2 m in the middle of the map, on gentle dunes; where the case does not push, the
     maps that the blade has just left. In float64."""
     rng = np.random.default_rng(seed)
@@ -130,7 +130,7 @@ def _pushed(heights: np.ndarray, strokes: np.ndarray, angles: np.ndarray) -> np.
 
 
 def against_differences(
-    case: Case, points: int = 64, seed: int = 0, cells: int = 32, chunk: int | None = None
+    case: GradientCase, points: int = 64, seed: int = 0, cells: int = 32, chunk: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors [3, P] of the gradient by each input against central differences at random points, in float64 and over the
     gradient's norm; and which of these points are smooth [3, P].
@@ -149,7 +149,7 @@ def against_differences(
     return error, smooth
 
 
-def _differences(case: Case, cells: int, batch: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _differences(case: GradientCase, cells: int, batch: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng, given = np.random.default_rng(seed), inputs(case, cells, batch, seed)
     with jax.enable_x64(True):
         x = cast(given, jnp.float64)
@@ -174,7 +174,7 @@ def _differences(case: Case, cells: int, batch: int, seed: int) -> tuple[np.ndar
     return np.array(error), np.array(smooth)
 
 
-def of_float32(case: Case, points: int = 64, seed: int = 0, cells: int = 32) -> np.ndarray:
+def of_float32(case: GradientCase, points: int = 64, seed: int = 0, cells: int = 32) -> np.ndarray:
     """Errors [P] of the gradient in float32 at random points, against that in float64, over its norm."""
     given = inputs(case, cells, points, seed)
     single = _gradient(case, cells)(*cast(given, jnp.float32))[1]
@@ -196,12 +196,12 @@ def relative(found: Any, right: Any) -> np.ndarray:
 
 
 @cache
-def _forward(case: Case, cells: int) -> Callable[..., Any]:
+def _forward(case: GradientCase, cells: int) -> Callable[..., Any]:
     return jax.jit(jax.vmap(program(case, cells)))
 
 
 @cache
-def _gradient(case: Case, cells: int) -> Callable[..., Any]:
+def _gradient(case: GradientCase, cells: int) -> Callable[..., Any]:
     return jax.jit(differentiated(program(case, cells)))
 
 

@@ -125,7 +125,7 @@ def bench(
 
 
 @dataclass(frozen=True)
-class Way:
+class Settler:
     """One way to do the job: `call` returns the sweeps of each of its `maps` (or None) and some of the maps it made."""
 
     call: Callable[[], tuple[Any, Any]]
@@ -154,20 +154,24 @@ def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 
         return np.array(sweeps), np.stack(maps)
 
     ways = {
-        "settle_batch": Way(lambda: ours(settle_batch(scene, heights)), batch, count),
-        "settle_batch, tolerance 1e-2": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, count),
-        "settle_batch, growth 0.8": Way(
+        "settle_batch": Settler(lambda: ours(settle_batch(scene, heights)), batch, count),
+        "settle_batch, tolerance 1e-2": Settler(
+            lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, count
+        ),
+        "settle_batch, growth 0.8": Settler(
             lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8))), batch, count
         ),
-        "settle_batch, growth 0.8, first 1/16": Way(
+        "settle_batch, growth 0.8, first 1/16": Settler(
             lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8, 1 / 16))), batch, count
         ),
-        "settle_batch, paper's sweep": Way(lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, count),
-        f"settle_batch, {fixed} of the paper's sweeps": Way(
+        "settle_batch, paper's sweep": Settler(
+            lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, count
+        ),
+        f"settle_batch, {fixed} of the paper's sweeps": Settler(
             lambda: ours(settle_batch(scene, heights, scheme=Relaxation(), stop=Sweeps(fixed))), batch, count
         ),
-        "vmap(settle)": Way(lambda: ours(vmapped(heights)), batch, count),
-        _NUMPY: Way(plain, sample),
+        "vmap(settle)": Settler(lambda: ours(vmapped(heights)), batch, count),
+        _NUMPY: Settler(plain, sample),
     }
     settle_c = compile_c()
     if settle_c is not None:
@@ -179,10 +183,10 @@ def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 
                 sweeps = np.concatenate(list(pool.map(lambda part: c(part, _SPACING, mu, **rule), parts)))
             return sweeps, np.concatenate(parts)[:sample]
 
-        ways[_C] = Way(lambda: threads(1), batch)
-        ways[f"C loop, {fixed} sweeps"] = Way(lambda: threads(1, tolerance=-1.0, bound=fixed), batch)
+        ways[_C] = Settler(lambda: threads(1), batch)
+        ways[f"C loop, {fixed} sweeps"] = Settler(lambda: threads(1, tolerance=-1.0, bound=fixed), batch)
         if count > 1:
-            ways[f"C loop, {count} cores"] = Way(lambda: threads(count), batch, count)
+            ways[f"C loop, {count} cores"] = Settler(lambda: threads(count), batch, count)
     small = partial(settle_numpy, rate=1 / 64, tolerance=1e-6)
     limit = np.stack([small(h.astype(float), _SPACING, mu)[0] for h in host[:sample]])
     largest = np.abs(limit - host[:sample]).max()

@@ -39,7 +39,7 @@ _BOUND = 400_000
 
 
 @dataclass(frozen=True)
-class Problem:
+class Collapse:
     """Sand of one spacing to a cell: `heights(n)` on n cells a side (or in a row), its angle, and the exact end if known."""
 
     name: str
@@ -91,19 +91,19 @@ def roof(n: int) -> np.ndarray:
     return MU * np.minimum(near[:, None], near[None, :])
 
 
-COLUMN = Problem("column of N/2 cells", _disc(1 / 2), (80, 160, 320))
+COLUMN = Collapse("column of N/2 cells", _disc(1 / 2), (80, 160, 320))
 STIFF = (
     COLUMN,
-    Problem("trench across", trench, (128, 256, 512)),
-    Problem("5 degrees", _disc(1 / 8), (80, 160, 320), 5.0),
+    Collapse("trench across", trench, (128, 256, 512)),
+    Collapse("5 degrees", _disc(1 / 8), (80, 160, 320), 5.0),
 )
-TABLE = Problem("overfilled table", lambda n: np.full((n, n), n / 2), (32, 64, 128), exact=roof, edge=Draining())
-ISOTROPIC = Problem("column, isotropic", _disc(1 / 2), (40, 80, 160), neighbours="isotropic")
-RIDGE = Problem("ridge, one dimension", _ridge, (64, 128, 256), exact=_ridge_settled)
+TABLE = Collapse("overfilled table", lambda n: np.full((n, n), n / 2), (32, 64, 128), exact=roof, edge=Draining())
+ISOTROPIC = Collapse("column, isotropic", _disc(1 / 2), (40, 80, 160), neighbours="isotropic")
+RIDGE = Collapse("ridge, one dimension", _ridge, (64, 128, 256), exact=_ridge_settled)
 ALL = (*STIFF, ISOTROPIC, TABLE, RIDGE)
 
 
-def work_precision(problems: tuple[Problem, ...], tell: Tell = quiet, sizes: int = 3) -> list[dict[str, Any]]:
+def work_precision(problems: tuple[Collapse, ...], tell: Tell = quiet, sizes: int = 3) -> list[dict[str, Any]]:
     """A row for every problem, size, scheme and tolerance: errors, sweeps, seconds, and the compile time apart."""
     rows = []
     for problem in problems:
@@ -134,7 +134,7 @@ def distance(height: np.ndarray, end: np.ndarray, start: np.ndarray) -> float:
     return float(np.abs(height - end).max() / np.abs(end - start).max())
 
 
-def reference(problem: Problem, n: int) -> np.ndarray:
+def reference(problem: Collapse, n: int) -> np.ndarray:
     """The limit of small steps, in float64."""
     with jax.enable_x64(True):
         start = jnp.asarray(problem.heights(n), jnp.float64)
@@ -157,7 +157,7 @@ def reference_check(tell: Tell = quiet) -> list[dict[str, Any]]:
     return rows
 
 
-def _runs(problem: Problem, n: int, scheme: Scheme) -> list[dict[str, Any]]:
+def _runs(problem: Collapse, n: int, scheme: Scheme) -> list[dict[str, Any]]:
     """One run for every tolerance, in float32."""
     scene, start = problem.scene(n), jnp.asarray(problem.heights(n), jnp.float32)
     program = jax.jit(lambda h, t: settle(scene, h, scheme=scheme, stop=UntilStill(t, bound=_BOUND)))

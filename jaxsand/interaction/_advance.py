@@ -31,7 +31,7 @@ State = tuple[jax.Array, Fluxes, Openness]  # heights, fluxes, and how sand stoo
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Ready:
+class Disturbed:
     """Sand that is yet to come to rest: how it stands near the blade and in the block, the blade's bottom (quanta; a number
     or a map near the blade), at which rate sand flows, its heights, a guess of what flows, and which share of a whole
     sub-step this one is."""
@@ -50,7 +50,7 @@ class Ready:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Cut:
+class SubStep:
     """What a blade does in a sub-step: the leg, with the bottom where the blade is now; its footprints; whether it moves, or
     has just come down; which share of a whole sub-step this one is; and what leaves the cells near the blade (quanta)."""
 
@@ -62,7 +62,7 @@ class Cut:
 
 
 @dataclass(frozen=True)
-class Step:
+class LegStep:
     """A step of a loop that computes a batch in the last axis; see while_loop.py."""
 
     block: Block
@@ -96,7 +96,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Advance(Step):
+class Advance(LegStep):
     """So many sub-steps ahead, `chunk` of them within a spacing, in a block around where they lead.
 
     If the blade has just come down, the first step lets the sand come to rest around it.
@@ -130,11 +130,11 @@ class Advance(Step):
             if way.room is not None:
                 into, scooped = blade.scooped(way.room, scooped, taken * at(self.block.part(view.holds)))
                 h, taken = self.block.put(h, self.block.part(h) - into), taken - into
-            ready, lost = self.displaced(cut, rate, view, (h, flux, stand), taken)
-            h, new = self.rest(ready.sand, ready.rate, self.sweeps, ready.height, ready.guess)
+            disturbed, lost = self.displaced(cut, rate, view, (h, flux, stand), taken)
+            h, new = self.rest(disturbed.sand, disturbed.rate, self.sweeps, disturbed.height, disturbed.guess)
             if gone is not None and lost is not None:
                 gone = gone + lost + new[-1]
-            return (h, self.kept(ready.part, new, flux), ready.openness()), gone, scooped
+            return (h, self.kept(disturbed.part, new, flux), disturbed.openness()), gone, scooped
 
         state = (old, flux, self.block.clear(view))
         (new, after, _), gone, scooped = lax.fori_loop(0, self.chunk, substep, (state, gone, sand.scooped))
@@ -159,14 +159,14 @@ class Advance(Step):
         lowest = way if way.rise is None else way.at(jnp.where(way.rise < 0, begin + ahead, begin))
         return cover, way.rate * self.block.contact(lowest, view, cover, h)
 
-    def ready(
+    def disturbed(
         self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: State
-    ) -> tuple[Ready, jax.Array | None]:
+    ) -> tuple[Disturbed, jax.Array | None]:
         """Sub-step i of step k up to when the sand comes to rest, and what was lost."""
         cut = self.cut(way, k, first, view, i, self.block.part(state[0]))
         return self.displaced(cut, rate, view, state, cut.taken)
 
-    def cut(self, way: Way, k: jax.Array, first: First, view: View, i: jax.Array, near: jax.Array) -> Cut:
+    def cut(self, way: Way, k: jax.Array, first: First, view: View, i: jax.Array, near: jax.Array) -> SubStep:
         """What the blade cuts in sub-step i of step k from the heights `near` it."""
         moving = k >= int(self.lowered)
         begin = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(way.length.dtype) * self.substep
@@ -178,7 +178,7 @@ class Advance(Step):
         else:
             taken, bottom = self.beneath(way, reach, view, near, begin, ahead)
             way = replace(way, bottom=bottom * spread(way.quantum, near))
-        return Cut(way, reach, moving, jnp.where(moving, ahead / self.substep, 1), jnp.where(ahead > 0, taken, 0))
+        return SubStep(way, reach, moving, jnp.where(moving, ahead / self.substep, 1), jnp.where(ahead > 0, taken, 0))
 
     def reach(self, way: Way, first: First, begin: jax.Array, ahead: jax.Array) -> blade.Reach:
         """The blade's footprints as it moves ahead from `begin` (spacings)."""
@@ -211,8 +211,8 @@ class Advance(Step):
         return blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near)), new
 
     def displaced(
-        self, cut: Cut, rate: jax.Array, view: View, state: State, taken: jax.Array
-    ) -> tuple[Ready, jax.Array | None]:
+        self, cut: SubStep, rate: jax.Array, view: View, state: State, taken: jax.Array
+    ) -> tuple[Disturbed, jax.Array | None]:
         """The sand after `taken` of what was cut has left to the front, yet to come to rest, and what was lost."""
         h, flux, clear = state
         way, frame = cut.way, frame_of(self.block.shape, cut.way.start)
@@ -228,7 +228,7 @@ class Advance(Step):
         near = self.block.beside(view, cut.reach)
         sand = self.block.sand(way, view, clear, near)
         guess = self.block.guess(near.gates, jnp.where(cut.moving, cut.part, 0), flux)
-        return Ready(near, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
+        return Disturbed(near, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
 
     def bottom(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
         """The blade's bottom over each cell near it (quanta), when it has moved by a length (spacings).
@@ -293,16 +293,16 @@ class _Inside:
         way = self.merge(floats)
         return self.advance.felt(way, self.k, self.first, self._view(way), h)[1]
 
-    def ready(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Ready:
+    def disturbed(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Disturbed:
         way = self.merge(floats)
         view = self._view(way)
         state = (h, flux, self.advance.block.clear(view))
-        return self.advance.ready(way, rate, self.k, self.first, view, i, state)[0]
+        return self.advance.disturbed(way, rate, self.k, self.first, view, i, state)[0]
 
     def substep(self, floats: Any, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
-        ready = self.ready(i, floats, rate, h, flux)
-        h, new = bring_to_rest(ready.sand, ready.rate, self.advance.sweeps, ready.height, ready.guess)
-        return h, self.advance.kept(ready.part, new, flux)
+        disturbed = self.disturbed(i, floats, rate, h, flux)
+        h, new = bring_to_rest(disturbed.sand, disturbed.rate, self.advance.sweeps, disturbed.height, disturbed.guess)
+        return h, self.advance.kept(disturbed.part, new, flux)
 
     def vjp(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Any, jax.Array, Fluxes]:
         """The cotangents of the floats, the heights and the fluxes: from the last sub-step backwards, made again."""
@@ -344,7 +344,9 @@ class _Inside:
         self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes
     ) -> tuple[tuple[Rested, Fluxes], Sand]:
         """What the sand's coming to rest depends on, the fluxes that are kept beside its own, and the sand."""
-        ready = self.ready(i, floats, rate, h, flux)
-        near, sand = ready.near, ready.sand
-        rested = Rested(near.gates, near.stretch, ready.bottom, sand.drop, ready.rate, ready.height, ready.guess)
-        return (rested, tuple((1 - ready.part) * f for f in flux) if self.advance.keeps else ()), sand
+        disturbed = self.disturbed(i, floats, rate, h, flux)
+        near, sand = disturbed.near, disturbed.sand
+        rested = Rested(
+            near.gates, near.stretch, disturbed.bottom, sand.drop, disturbed.rate, disturbed.height, disturbed.guess
+        )
+        return (rested, tuple((1 - disturbed.part) * f for f in flux) if self.advance.keeps else ()), sand

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._advance import Step
+from jaxsand.interaction._advance import LegStep
 from jaxsand.interaction._block import Moving, Way, normal_of
 from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
@@ -19,7 +19,7 @@ Carried: TypeAlias = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, w
 
 
 @dataclass(frozen=True)
-class Lower(Step):
+class Lower(LegStep):
     """The step in which the blade comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1

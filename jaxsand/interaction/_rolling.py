@@ -10,7 +10,7 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat_until
 from jaxsand.interaction import _wheel as wheel
-from jaxsand.interaction._advance import Step
+from jaxsand.interaction._advance import LegStep
 from jaxsand.interaction._block import Block, Moving, View, pose_ahead, rotated
 from jaxsand.interaction._frame import Frame, frame_of, shifted
 from jaxsand.interaction._wheel import Placed, Track
@@ -24,7 +24,7 @@ Carried = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was los
 
 
 @dataclass(frozen=True)
-class _OfWheel(Step):
+class _OfWheel(LegStep):
     """A step whose params are a wheel's track."""
 
     def work(self, way: Any) -> jax.Array:
@@ -96,7 +96,7 @@ class _Moved(_OfWheel):
 
 
 @dataclass(frozen=True)
-class Turn(_Moved):
+class WheelTurn(_Moved):
     """A sub-step of a turn in place, which moves the wheel's corners by `substep` spacings."""
 
     def done(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._advance import Rest, Step
+from jaxsand.interaction._advance import LegStep, Rest
 from jaxsand.interaction._block import Moving, Way, normal_of, rotated
 from jaxsand.interaction._frame import Frame
 from jaxsand.interaction.resting import bring_to_rest
@@ -16,7 +16,7 @@ from jaxsand.relaxation.ghost_cells import at
 
 
 @dataclass(frozen=True)
-class Turn(Step):
+class BladeTurn(LegStep):
     """A sub-step of a turn in place, which moves the blade's corners by `substep` spacings."""
 
     substep: float = 0.125

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
-from jaxsand.relaxation._rkl import Stages
+from jaxsand.relaxation._rkl import RklStages
 from jaxsand.relaxation.flux import Cells, Fluxes, WholeCells, fluxes, fluxes_zero, link_flux, worst_excess
 from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, truncate
 from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
@@ -72,7 +72,7 @@ def sweep_loop(
     limits: Limits | None = None
     if isinstance(scheme, Schedule):
         begin = partial(_with_momentum, bed)
-        body = Stages(scheme, interval)
+        body = RklStages(scheme, interval)
         rate = float(scheme.rates[-1])
         done = partial(_still_after_a_step, scheme, interval)
         between = partial(_between_steps, scheme, interval)

@@ -21,7 +21,7 @@ State: TypeAlias = tuple[jax.Array, Lost, Fluxes]  # a map with ghost cells, its
 
 
 @dataclass(frozen=True)
-class Stages:
+class RklStages:
     """A group of `interval` RKL stages of a schedule. `params` are the bed, the cells, and limits that it does not use.
 
     With 4 or 8 neighbours, a closed edge and no floor it records two bits for each link and stage, from which
