@@ -56,7 +56,7 @@ class Loop:
         done = None if self.done is None else jax.vmap(self.done, in_axes=(axes, None, 0))
         return Loop(done, _Many(self.step, axes), self.bound, self.batch_axes + 1)
 
-    def ready(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
+    def ended(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
         """Which maps stop before step k: booleans with the leading batch axes, one for a whole trailing batch."""
         over = k >= self.bound
         return over if self.done is None else over | self.done(params, k, state)
@@ -77,12 +77,12 @@ class Loop:
         """Which maps had stopped before step k."""
         return jnp.zeros((), bool) if count is None else k >= count
 
-    def keep(self, ready: jax.Array, old: Tree, new: Tree) -> Tree:
-        """The old state of the maps that are ready, the new one of the others."""
-        if not self.batch_axes or not ready.ndim:
+    def keep(self, ended: jax.Array, old: Tree, new: Tree) -> Tree:
+        """The old state of the maps that have ended, the new one of the others."""
+        if not self.batch_axes or not ended.ndim:
             return new
         return jax.tree.map(
-            lambda x, y: jnp.where(ready.reshape(ready.shape + (1,) * (x.ndim - self.batch_axes)), x, y), old, new
+            lambda x, y: jnp.where(ended.reshape(ended.shape + (1,) * (x.ndim - self.batch_axes)), x, y), old, new
         )
 
     def put(self, tape: Tree, k: jax.Array, record: Tree) -> Tree:
@@ -184,15 +184,15 @@ def run(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree]:
     """Runs the loop: the last state, and the number of steps."""
 
     def advance(carry: Tree) -> Tree:
-        state, k, count, ready = carry
-        state = loop.keep(ready, state, loop.step(params, k, state))
-        k, count = k + 1, count + (~ready).astype(jnp.int32)
-        return state, k, count, ready | loop.ready(params, k, state)
+        state, k, count, ended = carry
+        state = loop.keep(ended, state, loop.step(params, k, state))
+        k, count = k + 1, count + (~ended).astype(jnp.int32)
+        return state, k, count, ended | loop.ended(params, k, state)
 
     zero = jnp.int32(0)
-    ready = loop.ready(params, zero, state)
+    ended = loop.ended(params, zero, state)
     state, _, count, _ = lax.while_loop(
-        lambda c: ~jnp.all(c[3]), advance, (state, zero, jnp.zeros(ready.shape, jnp.int32), ready)
+        lambda c: ~jnp.all(c[3]), advance, (state, zero, jnp.zeros(ended.shape, jnp.int32), ended)
     )
     return state, loop.taken(count)
 
@@ -206,12 +206,12 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
     """
 
     def advance(carry: Tree) -> Tree:
-        state, k, count, ready, tape = carry
+        state, k, count, ended, tape = carry
         new, record = loop.step.recorded(params, k, state)
         tape = loop.put(tape, k % loop.room, record)
-        state = loop.keep(ready, state, new)
-        k, count = k + 1, count + (~ready).astype(jnp.int32)
-        return state, k, count, ready | loop.ready(params, k, state), tape
+        state = loop.keep(ended, state, new)
+        k, count = k + 1, count + (~ended).astype(jnp.int32)
+        return state, k, count, ended | loop.ended(params, k, state), tape
 
     def stretch(carry: Tree) -> Tree:
         carry, stride, (places, saved) = carry
@@ -226,9 +226,9 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
         return carry, stride, (places, saved)
 
     zero = jnp.int32(0)
-    ready = loop.ready(params, zero, state)
+    ended = loop.ended(params, zero, state)
     _, record = jax.eval_shape(loop.step.recorded, params, zero, state)
-    carry = (state, zero, jnp.zeros(ready.shape, jnp.int32), ready, loop.blank(loop.room, record))
+    carry = (state, zero, jnp.zeros(ended.shape, jnp.int32), ended, loop.blank(loop.room, record))
     if loop.bound <= loop.room:
         state, _, count, _, tape = lax.while_loop(lambda c: ~jnp.all(c[3]), advance, carry)
         return state, loop.taken(count), tape, ()

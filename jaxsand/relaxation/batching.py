@@ -49,9 +49,9 @@ def loop_batch(
 
 def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
     """The state after chunks of the maps that still move were swept once more until few are left."""
-    _, _, taken, ready = state
-    order = jnp.argsort(jnp.where(ready, jnp.iinfo(jnp.int32).max, taken))
-    left = jnp.sum(~ready)
+    _, _, taken, ended = state
+    order = jnp.argsort(jnp.where(ended, jnp.iinfo(jnp.int32).max, taken))
+    left = jnp.sum(~ended)
 
     def one(i: jax.Array, state: Tree) -> Tree:
         who = lax.dynamic_slice(order, (i * chunk,), (chunk,))
@@ -71,34 +71,34 @@ def _together(
     height: jax.Array,
     lost: Lost,
     taken: jax.Array,
-    ready: jax.Array,
+    ended: jax.Array,
 ) -> Tree:
-    """Sweeps the maps of a chunk until all are ready; where there are `others` to join, until all but a few are.
+    """Sweeps the maps of a chunk until all are still; where there are `others` to join, until all but a few are.
 
-    Returns for each map its result, what it lost, the number of groups of sweeps, and whether it is ready.
+    Returns for each map its result, what it lost, the number of groups of sweeps, and whether it has ended.
     """
-    few = ready.shape[0] // _LEFT
+    few = ended.shape[0] // _LEFT
 
     def look(k: jax.Array, moving: Tree) -> jax.Array:
         return (k >= groups) | loop.done(loop.params, k, moving)
 
     def goes_on(carry: Tree) -> jax.Array:
-        _, _, taken, ready = carry
-        aside = others & (jnp.sum(~ready) <= few) & jnp.all(ready | jax.vmap(loop.between)(taken))
-        return ~jnp.all(ready) & ~aside
+        _, _, taken, ended = carry
+        aside = others & (jnp.sum(~ended) <= few) & jnp.all(ended | jax.vmap(loop.between)(taken))
+        return ~jnp.all(ended) & ~aside
 
     def advance(carry: Tree) -> Tree:
-        moving, sand, taken, ready = carry
+        moving, sand, taken, ended = carry
         moving = jax.vmap(partial(loop.body, loop.params))(taken, moving)
-        sand = jax.tree.map(lambda x, y: jnp.where(ready.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, moving[:2])
-        taken = taken + (~ready).astype(taken.dtype)
-        return moving, sand, taken, ready | jax.vmap(look)(taken, moving)
+        sand = jax.tree.map(lambda x, y: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, moving[:2])
+        taken = taken + (~ended).astype(taken.dtype)
+        return moving, sand, taken, ended | jax.vmap(look)(taken, moving)
 
     sand = jax.vmap(enter)(height, lost)
     moving = jax.vmap(loop.begin)(sand)
-    ready = ready | jax.vmap(look)(taken, moving)
-    _, sand, taken, ready = lax.while_loop(goes_on, advance, (moving, sand, taken, ready))
-    return jax.vmap(judge)(height, sand, taken * loop.interval), sand[1], taken, ready
+    ended = ended | jax.vmap(look)(taken, moving)
+    _, sand, taken, ended = lax.while_loop(goes_on, advance, (moving, sand, taken, ended))
+    return jax.vmap(judge)(height, sand, taken * loop.interval), sand[1], taken, ended
 
 
 def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int | None) -> Tree:
