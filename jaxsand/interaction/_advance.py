@@ -21,7 +21,7 @@ from jaxsand.interaction._resting_adjoint import Rested, blank, rest_taped, rest
 from jaxsand.interaction.resting import Links, Sand, bring_to_rest
 from jaxsand.interaction.stencil import inner, spread
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.relaxation.ghost_cells import Lost, at, halo
+from jaxsand.relaxation.ghost_cells import ExactSum, at, halo
 
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 
@@ -123,7 +123,9 @@ class Advance(LegStep):
         cover, rate = self.felt(way, k, first, view, old)
         gone = jnp.zeros_like(old) if self.block.drains else None
 
-        def substep(i: jax.Array, carry: tuple[State, jax.Array | None, Lost]) -> tuple[State, jax.Array | None, Lost]:
+        def substep(
+            i: jax.Array, carry: tuple[State, jax.Array | None, ExactSum | None]
+        ) -> tuple[State, jax.Array | None, ExactSum | None]:
             (h, flux, stand), gone, scooped = carry
             cut = self.cut(way, k, first, view, i, self.block.part(h))
             taken = cut.taken

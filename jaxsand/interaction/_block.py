@@ -13,7 +13,7 @@ from jaxsand.interaction.ground import Relief
 from jaxsand.interaction.resting import Sand, where_open
 from jaxsand.interaction.stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.relaxation.ghost_cells import Lost, at, halo, lose, nearest
+from jaxsand.relaxation.ghost_cells import ExactSum, at, halo, lose, nearest
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.tools import Pose
 
@@ -81,14 +81,14 @@ class Moving:
         lost: account of what drained, flat maps; see `ghost_cells.lose`.
         flux: fluxes of the last sub-step in the block around the blade (quanta).
         edge: largest change of height at the block's edge so far (spacings).
-        scooped: account (quanta) of what a bucket took up so far, a pair of numbers, or None for other tools.
+        scooped: account (quanta) of what a bucket took up so far, or None for other tools.
     """
 
     height: jax.Array
-    lost: Lost
+    lost: ExactSum | None
     flux: Fluxes
     edge: jax.Array
-    scooped: Lost = None
+    scooped: ExactSum | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -224,13 +224,13 @@ class Block:
         """The bottom of a tool over each cell of the inner part (quanta), which cuts no floor: `bottom`, or the floor."""
         return bottom if view.base is None else jnp.maximum(bottom, self.part(view.base))
 
-    def lose(self, way: Way, view: View, lost: Lost, amount: jax.Array | None) -> Lost:
+    def lose(self, way: Way, view: View, lost: ExactSum | None, amount: jax.Array | None) -> ExactSum | None:
         """The account of losses after the block lost an amount (quanta)."""
         if lost is None or amount is None:
             return lost
-        block = (cut(view.where, lost[0], 0.0), cut(view.where, lost[1], 0.0))
-        low, high = lose(way.quantum, block, amount * way.quantum)
-        return paste(view.where, lost[0], low), paste(view.where, lost[1], high)
+        block = ExactSum(cut(view.where, lost.low, 0.0), cut(view.where, lost.high, 0.0))
+        block = lose(way.quantum, block, amount * way.quantum)
+        return ExactSum(paste(view.where, lost.low, block.low), paste(view.where, lost.high, block.high))
 
     def touched(self, way: Way, frame: Frame, first: First, old: jax.Array, new: jax.Array, cover: jax.Array) -> jax.Array:
         """The largest change of height (spacings) in the block's outermost cells, along edges that are not the map's.

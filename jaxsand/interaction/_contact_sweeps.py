@@ -17,12 +17,12 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import ToolInSand, flows
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, stored
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, halo, stored
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 
 Params: TypeAlias = tuple[Bed, Flow, ToolInSand]
-State: TypeAlias = tuple[jax.Array, Lost]
+State: TypeAlias = tuple[jax.Array, ExactSum | None]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def surfaces(bed: Bed, flow: Flow, tool: ToolInSand, sweeps: int, height: jax.Ar
     return lax.dynamic_update_index_in_dim(tape, tool.surface(h), sweeps - 1, 0)
 
 
-def _sweep(bed: Bed, flow: Flow, tool: ToolInSand, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def _sweep(bed: Bed, flow: Flow, tool: ToolInSand, h: jax.Array, lost: ExactSum | None) -> tuple[jax.Array, ExactSum | None]:
     """One sweep of a map [H, W]; only its surface needs ghost cells."""
     moved = counted(flow, flows(bed, tool.open, halo(tool.surface(h))))
     return pass_over(bed, flow, moved, h, lost)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import repeat
 from jaxsand.interaction._contact_sweeps import Beside
 from jaxsand.relaxation.flux import tool_in_sand
-from jaxsand.relaxation.ghost_cells import Bed, Lost, truncate
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, truncate
 from jaxsand.relaxation.sweep import Flow
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
@@ -76,7 +76,9 @@ def contact(site: Site, cover: jax.Array, h: jax.Array) -> jax.Array:
     return jnp.minimum(1, 2 * jnp.max(jnp.max(near * cover, axis=0)))
 
 
-def settle_around(site: Site, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def settle_around(
+    site: Site, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: ExactSum | None
+) -> tuple[jax.Array, ExactSum | None]:
     """The height and the losses after some sweeps of the sand around a blade whose footprint is `cover`."""
     return repeat(Beside(sweeps), 1, (site.bed, flow, tool_in_sand(cover, site.bottom)), (h, lost))
 

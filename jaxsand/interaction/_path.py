@@ -13,7 +13,7 @@ from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._displacement import Site
 from jaxsand.relaxation.flux import worst_excess
 from jaxsand.relaxation.ghost_cells import (
-    Lost,
+    ExactSum,
     below_base,
     halo,
     largest,
@@ -75,10 +75,10 @@ class State:
     """
 
     height: jax.Array
-    lost: Lost
+    lost: ExactSum | None
     moved: jax.Array
     kept: Tree
-    scooped: Lost
+    scooped: ExactSum | None
 
 
 Leg = Callable[[Site, Pose, jax.Array, Pose | None, State], State]
@@ -113,7 +113,7 @@ def travelled(
     *,
     rises: bool = False,
     room: jax.Array | None = None,
-) -> tuple[Pushed, Tree, Lost]:
+) -> tuple[Pushed, Tree, ExactSum | None]:
     """Lowers the tool at path[0], moves it along the legs of `path` (m) and lifts it.
 
     `leg(site, pose, length, before, state)` moves the tool from `pose` by `length` (m). `before` is the tool's pose at the
@@ -124,7 +124,7 @@ def travelled(
     take up a sum of heights of `room` (m).
 
     Returns the map after the path, what `record(height)` returned after each leg, stacked, and the sum of heights (m) that a
-    bucket took up, as an account (low, high).
+    bucket took up, as an account.
     """
     if path.shape[1] == 3 and not rises:
         raise ValueError(
@@ -152,7 +152,7 @@ def travelled(
     if isinstance(scene.window, Window):
         moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
     zero = jnp.zeros_like(site.bottom)
-    state = State(intact, lost, moved, (), None if room is None else (zero, zero))
+    state = State(intact, lost, moved, (), None if room is None else ExactSum(zero, zero))
 
     def at_height(start: jax.Array, stop: jax.Array, length: jax.Array) -> Site:
         if not start.size:

@@ -34,7 +34,7 @@ from jaxsand.interaction._overflow import RimAhead, nothing_beyond
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._shade import on_line, within_reach
 from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
-from jaxsand.relaxation.ghost_cells import Lost, lose
+from jaxsand.relaxation.ghost_cells import ExactSum, lose
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene, deep
@@ -132,8 +132,15 @@ def push_swath(
 
 
 def _sweep_out(  # noqa: PLR0915
-    scene: Scene, site: Site, pose: Pose, length: jax.Array, old: jax.Array, lowered: bool, h: jax.Array, lost: Lost
-) -> tuple[jax.Array, Lost]:
+    scene: Scene,
+    site: Site,
+    pose: Pose,
+    length: jax.Array,
+    old: jax.Array,
+    lowered: bool,
+    h: jax.Array,
+    lost: ExactSum | None,
+) -> tuple[jax.Array, ExactSum | None]:
     """One leg: takes up the sand in the way and sets it down."""
     dx, tool = site.bed.spacing, site.tool
     half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2

@@ -34,6 +34,7 @@ from jaxsand.interaction._lowering import Lower
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, heading, travelled, upright
 from jaxsand.interaction._turning import BladeTurn
 from jaxsand.interaction.resting import bring_to_rest
+from jaxsand.relaxation.ghost_cells import ExactSum
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, Number, Pose
 from jaxsand.scene.validation import concrete
@@ -69,14 +70,14 @@ def scoop_along(
     push: "SteppedPush",
     room: Float[Array, ""],
     record: Record | None = None,
-) -> tuple[Pushed, Tree, tuple[jax.Array, jax.Array]]:
+) -> tuple[Pushed, Tree, ExactSum]:
     """Moves a bucket's edge along `path` (m); what it cuts goes into the bucket, up to a sum of heights of `room` (m).
 
     The scene's tool is a blade as wide as the edge, a cell thick at most. It is moved such that its rear starts at path[0]
     and its front ends at path[-1], so that what it cuts lies between the path's ends. First and last legs shorter than half
     a cell are cut a little beyond their ends. Every leg keeps some of its length, and thereby its heading.
 
-    Returns the map, what `record` returned after each leg, and the account (low, high) of the sum of heights (m) in the
+    Returns the map, what `record` returned after each leg, and the account of the sum of heights (m) in the
     bucket.
     """
     runs = path[1:] - path[:-1]

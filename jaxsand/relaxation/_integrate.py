@@ -13,13 +13,13 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Step, repeat, repeat_until
 from jaxsand.relaxation._rkl import RklStages
 from jaxsand.relaxation.flux import Cells, Fluxes, WholeCells, fluxes, fluxes_zero, link_flux, worst_excess
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, truncate
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, grain, truncate
 from jaxsand.relaxation.schemes import Pairwise, Relaxation, Schedule
 from jaxsand.relaxation.sweep import Flow, Sweep, apply, within
 from jaxsand.scene.grid import links
 
-Sand: TypeAlias = tuple[jax.Array, Lost]  # a map with ghost cells, and what it lost over the rim
-State: TypeAlias = Sand | tuple[jax.Array, Lost, Fluxes]
+Sand: TypeAlias = tuple[jax.Array, ExactSum | None]  # a map with ghost cells, and what it lost over the rim
+State: TypeAlias = Sand | tuple[jax.Array, ExactSum | None, Fluxes]
 Rate: TypeAlias = jax.Array | float
 Limits: TypeAlias = tuple[jax.Array, jax.Array]  # see `still`
 Params: TypeAlias = tuple[Bed, Cells, Limits | None, *tuple[Rate, ...]]
@@ -144,7 +144,7 @@ def _pairs(interval: int, params: Swept, k: jax.Array, state: Sand) -> Sand:
     return repeat(_EACH_PAIR, interval, (bed, flow), state)
 
 
-def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: Lost) -> Sand:
+def _each_pair(bed: Bed, flow: Flow, u: jax.Array, lost: ExactSum | None) -> Sand:
     """One sweep of `Pairwise`: in each direction every other pair, then the rest; `flow.rate` is half the share."""
     scale = flow.rate / flow.quantum
     for chosen, link in enumerate(links(bed.neighbours)):

@@ -11,13 +11,15 @@ from jax.typing import DTypeLike
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Cells, Fluxes, WholeCells
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, grain, halo
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, grain, halo
 from jaxsand.relaxation.schemes import Schedule
 from jaxsand.relaxation.sweep import Flow, rkl_stage
 
 Params: TypeAlias = tuple[Bed, Cells, Tree]
 Cotangents: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array]]  # cotangents of heights, fluxes, stable steps
-State: TypeAlias = tuple[jax.Array, Lost, Fluxes]  # a map with ghost cells, its losses, and what links moved last (m)
+State: TypeAlias = tuple[
+    jax.Array, ExactSum | None, Fluxes
+]  # a map with ghost cells, its losses, and what links moved last (m)
 
 
 @dataclass(frozen=True)

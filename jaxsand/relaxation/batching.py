@@ -17,7 +17,7 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.relaxation._integrate import Sand, SweepLoop
-from jaxsand.relaxation.ghost_cells import Lost
+from jaxsand.relaxation.ghost_cells import ExactSum
 
 _CELLS = 65_536  # cells in a chunk, whose sweep then works in a core's cache
 _LEFT = 8  # a chunk stops when one in so many of its maps still moves
@@ -26,10 +26,10 @@ _LEFT = 8  # a chunk stops when one in so many of its maps still moves
 def loop_batch(
     loop: SweepLoop,
     groups: int,
-    enter: Callable[[jax.Array, Lost], Sand],
+    enter: Callable[[jax.Array, ExactSum | None], Sand],
     judge: Callable[[jax.Array, Sand, jax.Array], Tree],
     height: jax.Array,
-    lost: Lost,
+    lost: ExactSum | None,
     chunk: int,
 ) -> Tree:
     """`SweepLoop.run` for every map of a batch [B, H, W], B a multiple of the chunk.
@@ -65,11 +65,11 @@ def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
 def _together(
     loop: SweepLoop,
     groups: int,
-    enter: Callable[[jax.Array, Lost], Sand],
+    enter: Callable[[jax.Array, ExactSum | None], Sand],
     judge: Callable[[jax.Array, Sand, jax.Array], Tree],
     others: jax.Array | bool,
     height: jax.Array,
-    lost: Lost,
+    lost: ExactSum | None,
     taken: jax.Array,
     ended: jax.Array,
 ) -> Tree:

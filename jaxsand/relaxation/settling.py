@@ -16,7 +16,7 @@ from jaxsand.relaxation.batching import loop_batch, on_all_cores, wide_vectors
 from jaxsand.relaxation.flux import WholeCells, middle, steepest, worst_excess
 from jaxsand.relaxation.ghost_cells import (
     Bed,
-    Lost,
+    ExactSum,
     at,
     below_base,
     halo,
@@ -216,7 +216,7 @@ def run_off(scene: Scene, height: Float[Array, "H W"], scheme: Scheme, stop: Sto
     bed = prepare(scene)
     (u, lost), _ = _run(scene, bed, scheme, stop, (halo(mark(scene, height)[0]), nothing_lost(bed, height)))
     assert lost is not None
-    return at(u), lost[0] + lost[1]
+    return at(u), lost.value
 
 
 def _judge(
@@ -284,7 +284,7 @@ def relax_batch(rules: tuple[Scene, Scheme, Stop, Whole | Window], height: Float
         return lax.map(lambda h: relax(scene, h, scheme, stop, window), height, batch_size=chunk)
     bed, (bound, interval) = prepare(scene), _groups(stop)
 
-    def enter(h: jax.Array, lost: Lost) -> Sand:
+    def enter(h: jax.Array, lost: ExactSum | None) -> Sand:
         return halo(mark(scene, h)[0]), lost
 
     loop = _sweep_loop(scene, bed, scheme, stop)

@@ -11,7 +11,7 @@ from jaxsand.autodiff.while_loop import Plain, Tree, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.floor import held, no_more_than
 from jaxsand.relaxation.flux import Cells, Fluxes, PartialCells, WholeCells, fluxes, gained
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, halo, lose, truncate
 
 Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
 
@@ -25,7 +25,7 @@ class Flow:
     quantum: Float[Array, ""]
 
 
-def sweep(bed: Bed, flow: Flow, cells: Cells, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
+def sweep(bed: Bed, flow: Flow, cells: Cells, u: Ghosted, lost: ExactSum | None) -> tuple[Ghosted, ExactSum | None]:
     """One sweep of a map with ghost cells [H + 2, W + 2], by forward Euler.
 
     `lost` adds up the height that each cell lost over a draining rim (see `lose`); it is None where the edge is closed.
@@ -48,8 +48,8 @@ def within(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"]) -> Fluxe
 
 
 def rkl_stage(
-    bed: Bed, flow: Flow, momentum: Float[Array, ""], cells: Cells, state: tuple[Ghosted, Lost, Fluxes]
-) -> tuple[Ghosted, Lost, Fluxes]:
+    bed: Bed, flow: Flow, momentum: Float[Array, ""], cells: Cells, state: tuple[Ghosted, ExactSum | None, Fluxes]
+) -> tuple[Ghosted, ExactSum | None, Fluxes]:
     """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before.
 
     The state is a map with ghost cells, its account of losses, and what links moved last (in quanta).
@@ -62,7 +62,7 @@ def rkl_stage(
     return u, lost, moved
 
 
-def apply(bed: Bed, flow: Flow, moved: Fluxes, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
+def apply(bed: Bed, flow: Flow, moved: Fluxes, u: Ghosted, lost: ExactSum | None) -> tuple[Ghosted, ExactSum | None]:
     """The map with ghost cells after `moved` quanta crossed its links.
 
     `moved` must be stored, behind a barrier, so that both ends of a link use the same number.
@@ -71,7 +71,9 @@ def apply(bed: Bed, flow: Flow, moved: Fluxes, u: Ghosted, lost: Lost) -> tuple[
     return halo(h), lost
 
 
-def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"], lost: Lost) -> tuple[Float[Array, "H W"], Lost]:
+def pass_over(
+    bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"], lost: ExactSum | None
+) -> tuple[Float[Array, "H W"], ExactSum | None]:
     """`apply` for a map [H, W] without ghost cells."""
     if lost is not None:
         lost = lose(flow.quantum, lost, moved[-1] * flow.quantum)
@@ -88,9 +90,9 @@ class Sweep(Plain):
         self,
         params: tuple[Bed, Flow, Cells],
         k: jax.Array,
-        record: tuple[jax.Array, Lost],
-        cotangent: tuple[jax.Array, Lost],
-    ) -> tuple[Tree, tuple[jax.Array, Lost]]:
+        record: tuple[jax.Array, ExactSum | None],
+        cotangent: tuple[jax.Array, ExactSum | None],
+    ) -> tuple[Tree, tuple[jax.Array, ExactSum | None]]:
         """The vjp, with 4 or 8 neighbours, a closed edge and no floor by the formulas of flux_adjoint.py, else by JAX."""
         bed, flow, cells = params
         if not bed.by_links:
