@@ -20,7 +20,7 @@ from jaxsand.relaxation.ghost_cells import at, halo, largest, prepare, quantum
 from jaxsand.relaxation.schemes import Relaxation
 from jaxsand.relaxation.settling import relax, settle, settle_batch
 from jaxsand.relaxation.stopping import UntilStill
-from jaxsand.relaxation.sweep import Flow, sweep
+from jaxsand.relaxation.sweep import Flow, Swept, sweep
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 
@@ -74,7 +74,7 @@ def activity(n: int = 160, sweeps: int = 1000) -> dict[str, Any]:
     flow = Flow(jnp.float32(0.125), quantum(largest(h)))
 
     def one(u: jax.Array, _: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        after = sweep(bed, flow, WholeCells(), u, None)[0]
+        after = sweep(bed, flow, WholeCells(), Swept(u, None)).height
         moved = jnp.abs(at(after) - at(u)) > 1e-3 * bed.drop
         sides = [jnp.any(moved, axis=axis) for axis in (0, 1)]
         spans = [jnp.max(jnp.where(s, jnp.arange(n), -1)) - jnp.min(jnp.where(s, jnp.arange(n), n)) + 3 for s in sides]

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.relaxation._integrate import Sand, still, sweep_loop
+from jaxsand.relaxation._integrate import still, sweep_loop
 from jaxsand.relaxation.flux import Cells, PartialCells, WholeCells
 from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo, nothing_lost, rim_of, truncate
 from jaxsand.relaxation.schemes import Multilevel, schedule
+from jaxsand.relaxation.sweep import Limits, Swept
 
 
 def descend(
@@ -25,14 +26,14 @@ def descend(
     tolerance: jax.Array,
     bound: int,
     interval: int,
-    sand: Sand,
+    sand: Swept,
     level: int = 0,
-) -> tuple[Sand, jax.Array]:
+) -> tuple[Swept, jax.Array]:
     """Settles on this grid and the coarser ones.
 
     Returns the sand, and the number of sweeps, where four of the next coarser grid count as one of this.
     """
-    rows, columns = (n - 2 for n in sand[0].shape)
+    rows, columns = (n - 2 for n in sand.height.shape)
     early = schedule(scheme.steps(), limit, bound, interval, scheme.handover / 4 if level else 0.0)
     narrow = max(rows, columns) if 1 in (rows, columns) else min(rows, columns)
     if narrow < 2 * scheme.coarsest:
@@ -42,20 +43,19 @@ def descend(
     groups = int(ends[0]) // interval if ends.size else bound // interval
     sand, taken = sweep_loop(bed, cells, early, tolerance, interval).run(groups, sand)
 
-    cut = grain(bed, sand[0])
-    wide_bed, wide_cells, wide = _widen(bed, cells, cut, at(sand[0]))
-    begun = (halo(wide), nothing_lost(wide_bed, wide))
+    cut = grain(bed, sand.height)
+    wide_bed, wide_cells, wide = _widen(bed, cells, cut, at(sand.height))
+    begun = Swept(halo(wide), nothing_lost(wide_bed, wide))
     # To half the tolerance, or rounding on the finer grid would set the sand in motion everywhere.
     stiller = tolerance if level else tolerance / 2
-    (ended, lost), more = descend(wide_bed, wide_cells, scheme, limit, stiller, bound, interval, begun, level + 1)
-    early_end = still(bed, cells, (tolerance, 2 / (scheme.safety * limit * bed.spacing)), sand[0])
-    change = jnp.where(jnp.isnan(wide) | early_end, 0, at(ended) - wide)
-    u, gone = sand
-    u = halo(at(u) + _spread(cells, cut, change, at(u)))
-    if gone is not None and lost is not None:
-        gone = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), gone, lost)
+    ended, more = descend(wide_bed, wide_cells, scheme, limit, stiller, bound, interval, begun, level + 1)
+    early_end = still(bed, cells, Limits(tolerance, 2 / (scheme.safety * limit * bed.spacing)), sand.height)
+    change = jnp.where(jnp.isnan(wide) | early_end, 0, at(ended.height) - wide)
+    height, lost = halo(at(sand.height) + _spread(cells, cut, change, at(sand.height))), sand.lost
+    if lost is not None and ended.lost is not None:
+        lost = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), lost, ended.lost)
     late = schedule(scheme.steps(), limit, bound, interval)
-    sand, again = sweep_loop(bed, cells, late, tolerance, interval).run(bound // interval, (u, gone))
+    sand, again = sweep_loop(bed, cells, late, tolerance, interval).run(bound // interval, Swept(height, lost))
     return sand, taken + again + jnp.where(early_end, 0, (more + 3) // 4)
 
 

@@ -11,20 +11,16 @@ from jax.typing import DTypeLike
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import Cells, Fluxes, WholeCells
-from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, grain, halo
+from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo
 from jaxsand.relaxation.schemes import Schedule
-from jaxsand.relaxation.sweep import Flow, rkl_stage
+from jaxsand.relaxation.sweep import Flow, GroupParams, RklState, rkl_stage
 
-Params: TypeAlias = tuple[Bed, Cells, Tree]
 Cotangents: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array]]  # cotangents of heights, fluxes, stable steps
-State: TypeAlias = tuple[
-    jax.Array, ExactSum | None, Fluxes
-]  # a map with ghost cells, its losses, and what links moved last (m)
 
 
 @dataclass(frozen=True)
 class RklStages:
-    """A group of `interval` RKL stages of a schedule. `params` are the bed, the cells, and limits that it does not use.
+    """A group of `interval` RKL stages of a schedule. Between groups `last` is in m, within them in quanta.
 
     With 4 or 8 neighbours, a closed edge and no floor it records two bits for each link and stage, from which
     flux_adjoint.py computes the derivative. Else it records the state before the group, and JAX differentiates it.
@@ -34,41 +30,40 @@ class RklStages:
     interval: int
     tape: int = 16
 
-    def __call__(self, params: Params, k: jax.Array, state: State) -> State:
-        bed, cells, _ = params
-        rates, momenta = self._stages(k, state[0].dtype)
-        cut = grain(bed, state[0])
-        u, lost, last = state
-        state = (u, lost, tuple(m / cut for m in last))
-        u, lost, last = repeat(_STAGE, self.interval, (bed, cells, rates, momenta, cut), state)
-        return u, lost, tuple(m * cut for m in last)
+    def __call__(self, params: GroupParams, k: jax.Array, state: RklState) -> RklState:
+        bed, cells = params.bed, params.cells
+        rates, momenta = self._stages(k, state.height.dtype)
+        cut = grain(bed, state.height)
+        state = replace(state, last=tuple(m / cut for m in state.last))
+        state = repeat(_STAGE, self.interval, (bed, cells, rates, momenta, cut), state)
+        return replace(state, last=tuple(m * cut for m in state.last))
 
-    def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, Tree]:
-        bed, cells, _ = params
+    def recorded(self, params: GroupParams, k: jax.Array, state: RklState) -> tuple[RklState, Tree]:
+        bed, cells = params.bed, params.cells
         if not bed.by_links:
             return Plain(self).recorded(params, k, state)
-        rates, momenta = self._stages(k, state[0].dtype)
-        cut = grain(bed, state[0])
+        rates, momenta = self._stages(k, state.height.dtype)
+        cut = grain(bed, state.height)
 
-        def stage(i: jax.Array, carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+        def stage(i: jax.Array, carry: tuple[RklState, jax.Array]) -> tuple[RklState, jax.Array]:
             state, codes = carry
             word = lax.dynamic_index_in_dim(codes, i // 4, keepdims=False)
-            code = flux_adjoint.active(bed, _surface(cells, state[0])) << (8 * (i % 4)).astype(jnp.int32)
+            code = flux_adjoint.active(bed, _surface(cells, state.height)) << (8 * (i % 4)).astype(jnp.int32)
             codes = lax.dynamic_update_index_in_dim(codes, word | code, i // 4, 0)
             return rkl_stage(bed, Flow(rates[i], cut), momenta[i], cells, state), codes
 
-        u, lost, last = state
-        rows, columns = u.shape
+        rows, columns = state.height.shape
         codes = jnp.zeros((-(-self.interval // 4), rows - 1, columns - 1), jnp.int32)
-        (u, lost, last), codes = lax.fori_loop(0, self.interval, stage, ((u, lost, tuple(m / cut for m in last)), codes))
-        return (u, lost, tuple(m * cut for m in last)), codes
+        state = replace(state, last=tuple(m / cut for m in state.last))
+        state, codes = lax.fori_loop(0, self.interval, stage, (state, codes))
+        return replace(state, last=tuple(m * cut for m in state.last)), codes
 
-    def jvp(self, params: Params, k: jax.Array, record: Tree, dparams: Tree, dstate: State) -> State:
-        bed, cells, _ = params
+    def jvp(self, params: GroupParams, k: jax.Array, record: Tree, dparams: Tree, dstate: RklState) -> RklState:
+        bed, cells = params.bed, params.cells
         if not bed.by_links:
             return Plain(self).jvp(params, k, record, dparams, dstate)
-        rates, momenta = self._stages(k, dstate[0].dtype)
-        dbed = split(params)[1](dparams)[0]
+        rates, momenta = self._stages(k, dstate.height.dtype)
+        dbed = split(params)[1](dparams).bed
         weights = flux_adjoint.opened(bed, None if isinstance(cells, WholeCells) else cells.open)
         dyields = jax.jvp(lambda drop: flux_adjoint.yields(replace(bed, drop=drop)), (bed.drop,), (dbed.drop,))[1]
 
@@ -85,15 +80,15 @@ class RklStages:
             moved = lax.optimization_barrier(tuple(moved))
             return dh + flux_adjoint.gains(bed, moved), moved
 
-        last = flux_adjoint.to_lattice(bed, dstate[2])
-        dh, last = lax.fori_loop(0, self.interval, stage, (at(dstate[0]), last))
-        return halo(dh, 0.0), None, flux_adjoint.from_lattice(bed, last)
+        last = flux_adjoint.to_lattice(bed, dstate.last)
+        dh, last = lax.fori_loop(0, self.interval, stage, (at(dstate.height), last))
+        return RklState(halo(dh, 0.0), None, flux_adjoint.from_lattice(bed, last))
 
-    def vjp(self, params: Params, k: jax.Array, record: Tree, cotangent: State) -> tuple[Tree, State]:
-        bed, cells, _ = params
+    def vjp(self, params: GroupParams, k: jax.Array, record: Tree, cotangent: RklState) -> tuple[Tree, RklState]:
+        bed, cells = params.bed, params.cells
         if not bed.by_links:
             return Plain(self).vjp(params, k, record, cotangent)
-        rates, momenta = self._stages(k, cotangent[0].dtype)
+        rates, momenta = self._stages(k, cotangent.height.dtype)
         weights = flux_adjoint.opened(bed, None if isinstance(cells, WholeCells) else cells.open)
         lengths = flux_adjoint.opened(bed, None)
         stretch = weights if bed.drop.ndim else [w / v for w, v in zip(weights, lengths, strict=True)]
@@ -118,15 +113,15 @@ class RklStages:
             tilt = [t + rate * s for t, s in zip(tilt, signed, strict=True)]
             return gain + rate * _ease(cells, flux_adjoint.gains(bed, tuple(onward))), back, tilt
 
-        gain = at(cotangent[0])
-        last = [-p for p in flux_adjoint.to_lattice(bed, cotangent[2])]
+        gain = at(cotangent.height)
+        last = [-p for p in flux_adjoint.to_lattice(bed, cotangent.last)]
         tilt = [jnp.zeros_like(last[0])] * (len(last) if bed.drop.ndim else 1)
         gain, last, tilt = lax.fori_loop(0, self.interval, stage, (gain, last, tilt))
         last = [momenta[0] * y for y in last]
         dparams = jax.tree.map(jnp.zeros_like, params)
         drop = flux_adjoint.drop_cotangent(bed, tilt) if bed.drop.ndim else jnp.sum(tilt[0])
-        floats = split((replace(dparams[0], drop=drop), *dparams[1:]))[0]
-        return floats, (halo(gain, 0.0), None, flux_adjoint.from_lattice(bed, tuple(-p for p in last)))
+        floats = split(replace(dparams, bed=replace(dparams.bed, drop=drop)))[0]
+        return floats, RklState(halo(gain, 0.0), None, flux_adjoint.from_lattice(bed, tuple(-p for p in last)))
 
     def _stages(self, k: jax.Array, dtype: DTypeLike) -> tuple[jax.Array, jax.Array]:
         """The rate and the momentum of each stage of group k."""
@@ -156,7 +151,7 @@ def _ease(cells: Cells, change: jax.Array) -> jax.Array:
     return change if isinstance(cells, WholeCells) else cells.surface(change)
 
 
-def _one_stage(params: tuple[Bed, Cells, jax.Array, jax.Array, jax.Array], i: jax.Array, state: State) -> State:
+def _one_stage(params: tuple[Bed, Cells, jax.Array, jax.Array, jax.Array], i: jax.Array, state: RklState) -> RklState:
     bed, cells, rates, momenta, cut = params
     return rkl_stage(bed, Flow(rates[i], cut), momenta[i], cells, state)
 

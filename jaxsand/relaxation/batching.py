@@ -16,8 +16,9 @@ import numpy as np
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.relaxation._integrate import Sand, SweepLoop
+from jaxsand.relaxation._integrate import SweepLoop
 from jaxsand.relaxation.ghost_cells import ExactSum
+from jaxsand.relaxation.sweep import Swept
 
 _CELLS = 65_536  # cells in a chunk, whose sweep then works in a core's cache
 _LEFT = 8  # a chunk stops when one in so many of its maps still moves
@@ -26,8 +27,8 @@ _LEFT = 8  # a chunk stops when one in so many of its maps still moves
 def loop_batch(
     loop: SweepLoop,
     groups: int,
-    enter: Callable[[jax.Array, ExactSum | None], Sand],
-    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
+    enter: Callable[[jax.Array, ExactSum | None], Swept],
+    judge: Callable[[jax.Array, Swept, jax.Array], Tree],
     height: jax.Array,
     lost: ExactSum | None,
     chunk: int,
@@ -65,8 +66,8 @@ def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
 def _together(
     loop: SweepLoop,
     groups: int,
-    enter: Callable[[jax.Array, ExactSum | None], Sand],
-    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
+    enter: Callable[[jax.Array, ExactSum | None], Swept],
+    judge: Callable[[jax.Array, Swept, jax.Array], Tree],
     others: jax.Array | bool,
     height: jax.Array,
     lost: ExactSum | None,
@@ -90,7 +91,9 @@ def _together(
     def advance(carry: Tree) -> Tree:
         moving, sand, taken, ended = carry
         moving = jax.vmap(partial(loop.body, loop.params))(taken, moving)
-        sand = jax.tree.map(lambda x, y: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, moving[:2])
+        sand = jax.tree.map(
+            lambda x, y: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, Swept(moving.height, moving.lost)
+        )
         taken = taken + (~ended).astype(taken.dtype)
         return moving, sand, taken, ended | jax.vmap(look)(taken, moving)
 
@@ -98,7 +101,7 @@ def _together(
     moving = jax.vmap(loop.begin)(sand)
     ended = ended | jax.vmap(look)(taken, moving)
     _, sand, taken, ended = lax.while_loop(goes_on, advance, (moving, sand, taken, ended))
-    return jax.vmap(judge)(height, sand, taken * loop.interval), sand[1], taken, ended
+    return jax.vmap(judge)(height, sand, taken * loop.interval), sand.lost, taken, ended
 
 
 def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int | None) -> Tree:

@@ -152,7 +152,7 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
     from jaxsand.relaxation.flux import WholeCells, fluxes_zero
     from jaxsand.relaxation.ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.schemes import stable_rate
-    from jaxsand.relaxation.sweep import Flow, rkl_stage, sweep
+    from jaxsand.relaxation.sweep import Flow, RklState, Swept, rkl_stage, sweep
 
     i, j = np.indices((64, 64))
     h = jnp.asarray((-1.0) ** (i + j if wave == "board" else i))
@@ -162,14 +162,16 @@ def test_stable_ranges_within_two_per_cent(neighbours, wave):
 
     @jax.jit
     def relaxed(rate):
-        return jax.lax.fori_loop(0, 12, lambda _, u: sweep(bed, Flow(rate, quanta), WholeCells(), u, None)[0], halo(h))
+        return jax.lax.fori_loop(
+            0, 12, lambda _, sand: sweep(bed, Flow(rate, quanta), WholeCells(), sand), Swept(halo(h), None)
+        ).height
 
     @jax.jit
     def stepped(rate):
         def stage(k, state):
             return rkl_stage(bed, Flow(rate * (2 - 1 / (k + 1)), quanta), k / (k + 1), WholeCells(), state)
 
-        return jax.lax.fori_loop(0, 12, stage, (halo(h), None, fluxes_zero(bed, halo(h))))[0]
+        return jax.lax.fori_loop(0, 12, stage, RklState(halo(h), None, fluxes_zero(bed, halo(h)))).height
 
     for run in (relaxed, stepped):
         inside, outside = (float(jnp.abs(at(run(x * best))[28:36, 28:36]).max()) for x in (0.98, 1.02))
