@@ -197,13 +197,40 @@ def run(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree]:
     return state, loop.taken(count)
 
 
-def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
-    """Runs the loop for reverse mode: the last state, the number of steps, the tape, and the memory of earlier states.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Memory:
+    """States of a long loop that the forward pass kept.
 
-    The tape holds the record of step k in place k % room, for the last `loop.room` steps. The memory is empty where there
-    cannot be more steps than that. Else it is a pair: the steps before which states were kept, -1 for a free slot, and these
-    states.
+    Attributes:
+        places: the steps before which they were, -1 for a free slot.
+        saved: these states.
     """
+
+    places: jax.Array
+    saved: Tree
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Forward:
+    """A loop that ran, as reverse mode needs it.
+
+    Attributes:
+        end: the last state.
+        count: the number of steps of each map, or None where all take as many.
+        tape: the record of step k in place k % room, for the last `Loop.room` steps.
+        memory: earlier states; None where there cannot be more steps than that.
+    """
+
+    end: Tree
+    count: jax.Array | None
+    tape: Tree
+    memory: Memory | None
+
+
+def record(loop: Loop, params: Tree, state: Tree) -> Forward:
+    """Runs the loop for reverse mode."""
 
     def advance(carry: Tree) -> Tree:
         state, k, count, ended, tape = carry
@@ -214,7 +241,8 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
         return state, k, count, ended | loop.ended(params, k, state), tape
 
     def stretch(carry: Tree) -> Tree:
-        carry, stride, (places, saved) = carry
+        carry, stride, memory = carry
+        places, saved = memory.places, memory.saved
         k = carry[1]
         full = jnp.sum(places >= 0) == KEPT
         stride = jnp.where(full, 2 * stride, stride)
@@ -223,7 +251,7 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
         saved = loop.put(saved, slot, carry[0])
         places = places.at[slot].set(jnp.where(k % stride == 0, k, -1))
         carry = lax.while_loop(lambda c: (c[1] < k + loop.room) & ~jnp.all(c[3]), advance, carry)
-        return carry, stride, (places, saved)
+        return carry, stride, Memory(places, saved)
 
     zero = jnp.int32(0)
     ended = loop.ended(params, zero, state)
@@ -231,18 +259,18 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
     carry = (state, zero, jnp.zeros(ended.shape, jnp.int32), ended, loop.blank(loop.room, record))
     if loop.bound <= loop.room:
         state, _, count, _, tape = lax.while_loop(lambda c: ~jnp.all(c[3]), advance, carry)
-        return state, loop.taken(count), tape, ()
+        return Forward(state, loop.taken(count), tape, None)
     slots = min(-(-loop.bound // loop.room), KEPT + SPARE)
-    memory = (jnp.full(slots, -1, jnp.int32), loop.blank(slots, state))
-    (state, _, count, _, tape), _, (places, saved) = lax.while_loop(
+    memory = Memory(jnp.full(slots, -1, jnp.int32), loop.blank(slots, state))
+    (state, _, count, _, tape), _, memory = lax.while_loop(
         lambda c: ~jnp.all(c[0][3]), stretch, (carry, jnp.int32(loop.room), memory)
     )
-    places = jnp.broadcast_to(places, (*jax.tree.leaves(state)[0].shape[: loop.batch_axes], slots))
+    places = jnp.broadcast_to(memory.places, (*jax.tree.leaves(state)[0].shape[: loop.batch_axes], slots))
     places = loop.for_each_map(places)
-    return state, loop.taken(count), tape, (places, saved)
+    return Forward(state, loop.taken(count), tape, Memory(places, memory.saved))
 
 
-def jvp(loop: Loop, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
+def jvp(loop: Loop, params: Tree, state: Tree, count: jax.Array | None, dparams: Tree, dstate: Tree) -> Tree:
     """The jvp of the loop: the tangent of the last state. Computes the steps again."""
 
     def one(k: jax.Array, carry: Tree) -> Tree:
@@ -254,7 +282,9 @@ def jvp(loop: Loop, params: Tree, state: Tree, count: jax.Array, dparams: Tree, 
     return lax.fori_loop(0, loop.total(count), one, (state, dstate))[1]
 
 
-def vjp(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+def vjp(
+    loop: Loop, params: Tree, count: jax.Array | None, tape: Tree, memory: Memory | None, cotangent: Tree
+) -> tuple[Tree, Tree]:
     """The vjp of the loop: the cotangents of params and of the first state, computed from the last step backwards.
 
     `tape` and `memory` are those of `record`. Records that are no longer on the tape are computed anew from the last state
@@ -299,7 +329,8 @@ def vjp(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, co
         carry = backwards(first, end, tape, carry)
         return first, jnp.zeros((), bool), jnp.where(places < first, places, -1), saved, tape, carry
 
-    places, saved = memory
+    assert memory is not None
+    places = memory.places
     places = places[:, 0] if loop.width else places.reshape(-1, places.shape[-1])[0]
-    start = (total, jnp.ones((), bool), places, saved, tape, carry)
+    start = (total, jnp.ones((), bool), places, memory.saved, tape, carry)
     return lax.while_loop(lambda c: c[0] > 0, stretch, start)[-1]

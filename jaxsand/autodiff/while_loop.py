@@ -17,7 +17,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxsand.autodiff import _batched_while
-from jaxsand.autodiff._batched_while import Done, Loop
+from jaxsand.autodiff._batched_while import Done, Forward, Loop
 
 Tree: TypeAlias = _batched_while.Tree
 
@@ -138,11 +138,12 @@ def _loop_jvp(loop: Loop, primals: Tree, tangents: Tree) -> Tree:
     params, state = first_order(primals)
     dparams, dstate = tangents
     dparams = tuple(d for d in jax.tree.leaves(dparams) if d.dtype != jax.dtypes.float0)
-    end, count, tape, saved = _batched_while.batched(_batched_while.record, loop, params, state)
+    ran: Forward = _batched_while.batched(_batched_while.record, loop, params, state)
+    count = ran.count
     none = None if count is None else np.zeros(count.shape, jax.dtypes.float0)
     if not jax.tree.leaves((dparams, dstate)):
-        return (end, count), (dstate, none)
-    kept, shown = hidden((params, state, tape, saved))
+        return (ran.end, count), (dstate, none)
+    kept, shown = hidden((params, state, ran.tape, ran.memory))
     # One flat vector, so that vmap sees a single operand that is batched or not.
     start, unravel = ravel_pytree((dparams, dstate))
 
@@ -153,13 +154,13 @@ def _loop_jvp(loop: Loop, primals: Tree, tangents: Tree) -> Tree:
 
     def backward(_: object, vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
-        params, _, tape, saved = shown(kept)
-        df, dx = _batched_while.batched(_batched_while.vjp, loop, params, count, tape, saved, cx)
+        params, _, tape, memory = shown(kept)
+        df, dx = _batched_while.batched(_batched_while.vjp, loop, params, count, tape, memory, cx)
         return ravel_pytree((jax.tree.map(jnp.add, cf, df), dx))[0]
 
     # The solution of "identity times x = start" by rules of our own: how JAX is told a linear map and its transpose.
     out = unravel(lax.custom_linear_solve(lambda v: v, start, forward, backward))
-    return (end, count), (out[1], none)
+    return (ran.end, count), (out[1], none)
 
 
 def hidden(tree: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:

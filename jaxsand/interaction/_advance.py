@@ -26,7 +26,14 @@ from jaxsand.relaxation.ghost_cells import ExactSum, at, halo
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 
 
-State = tuple[jax.Array, Fluxes, Openness]  # heights, fluxes, and how sand stood last in the block
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class InBlock:
+    """The sand of a block: heights and fluxes (quanta), and how it stood last."""
+
+    height: jax.Array
+    flux: Fluxes
+    openness: Openness
 
 
 @jax.tree_util.register_dataclass
@@ -124,25 +131,26 @@ class Advance(LegStep):
         gone = jnp.zeros_like(old) if self.block.drains else None
 
         def substep(
-            i: jax.Array, carry: tuple[State, jax.Array | None, ExactSum | None]
-        ) -> tuple[State, jax.Array | None, ExactSum | None]:
-            (h, flux, stand), gone, scooped = carry
+            i: jax.Array, carry: tuple[InBlock, jax.Array | None, ExactSum | None]
+        ) -> tuple[InBlock, jax.Array | None, ExactSum | None]:
+            state, gone, scooped = carry
+            h = state.height
             cut = self.cut(way, k, first, view, i, self.block.part(h))
             taken = cut.taken
             if way.room is not None:
                 into, scooped = blade.scooped(way.room, scooped, taken * at(self.block.part(view.holds)))
                 h, taken = self.block.put(h, self.block.part(h) - into), taken - into
-            disturbed, lost = self.displaced(cut, rate, view, (h, flux, stand), taken)
+            disturbed, lost = self.displaced(cut, rate, view, replace(state, height=h), taken)
             h, new = self.rest(disturbed.sand, disturbed.rate, self.sweeps, disturbed.height, disturbed.guess)
             if gone is not None and lost is not None:
                 gone = gone + lost + new[-1]
-            return (h, self.kept(disturbed.part, new, flux), disturbed.openness()), gone, scooped
+            return InBlock(h, self.kept(disturbed.part, new, state.flux), disturbed.openness()), gone, scooped
 
-        state = (old, flux, self.block.clear(view))
-        (new, after, _), gone, scooped = lax.fori_loop(0, self.chunk, substep, (state, gone, sand.scooped))
-        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
+        state = InBlock(old, flux, self.block.clear(view))
+        state, gone, scooped = lax.fori_loop(0, self.chunk, substep, (state, gone, sand.scooped))
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, state.height, cover))
         lost = self.block.lose(way, view, sand.lost, gone)
-        out = Moving(self.block.back(way, view, sand.height, new), lost, after, edge, scooped)
+        out = Moving(self.block.back(way, view, sand.height, state.height), lost, state.flux, edge, scooped)
         by_jax = self.block.drains or way.room is not None or way.base is not None
         if by_jax or way.drop.ndim == sand.height.ndim:
             return out, sand
@@ -162,10 +170,10 @@ class Advance(LegStep):
         return cover, way.rate * self.block.contact(lowest, view, cover, h)
 
     def disturbed(
-        self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: State
+        self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: InBlock
     ) -> tuple[Disturbed, jax.Array | None]:
         """Sub-step i of step k up to when the sand comes to rest, and what was lost."""
-        cut = self.cut(way, k, first, view, i, self.block.part(state[0]))
+        cut = self.cut(way, k, first, view, i, self.block.part(state.height))
         return self.displaced(cut, rate, view, state, cut.taken)
 
     def cut(self, way: Way, k: jax.Array, first: First, view: View, i: jax.Array, near: jax.Array) -> SubStep:
@@ -213,10 +221,10 @@ class Advance(LegStep):
         return blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near)), new
 
     def displaced(
-        self, cut: SubStep, rate: jax.Array, view: View, state: State, taken: jax.Array
+        self, cut: SubStep, rate: jax.Array, view: View, state: InBlock, taken: jax.Array
     ) -> tuple[Disturbed, jax.Array | None]:
         """The sand after `taken` of what was cut has left to the front, yet to come to rest, and what was lost."""
-        h, flux, clear = state
+        h, flux, clear = state.height, state.flux, state.openness
         way, frame = cut.way, frame_of(self.block.shape, cut.way.start)
         pose = frame.pose
         room = self.block.part(view.holds if view.beyond is None else view.holds + view.beyond)
@@ -298,7 +306,7 @@ class _Inside:
     def disturbed(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Disturbed:
         way = self.merge(floats)
         view = self._view(way)
-        state = (h, flux, self.advance.block.clear(view))
+        state = InBlock(h, flux, self.advance.block.clear(view))
         return self.advance.disturbed(way, rate, self.k, self.first, view, i, state)[0]
 
     def substep(self, floats: Any, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._advance import LegStep
-from jaxsand.interaction._block import Moving, Way, normal_of
+from jaxsand.interaction._block import Carried, Moving, Way, normal_of
 from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at, truncate
 
 Params: TypeAlias = tuple[blade.Shares, jax.Array, jax.Array, tuple[jax.Array, jax.Array] | None]
-Carried: TypeAlias = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was lost, and what is carried (quanta)
 
 
 @dataclass(frozen=True)
@@ -49,9 +48,9 @@ class Lower(LegStep):
         gone = None if over is None else jnp.zeros_like(old)
         params = (shares, holds, cover, over)
         into, scooped = blade.scooped(way.room, sand.scooped, taken)
-        state = (old - taken, gone, taken - into)
-        (new, gone, carried), _ = repeat_until(_at_rest, Plain(_spread, 16), 2 * self.block.near, params, state)
-        new = self.block.put(whole, new + carried)
+        state = Carried(old - taken, gone, taken - into)
+        state, _ = repeat_until(_at_rest, Plain(_spread, 16), 2 * self.block.near, params, state)
+        gone, new = state.lost, self.block.put(whole, state.height + state.carried)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, whole, new, cover))
         lost = self.block.lose(way, view, sand.lost, None if gone is None else self.block.put(jnp.zeros_like(whole), gone))
         return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge, scooped)
@@ -60,13 +59,13 @@ class Lower(LegStep):
 def _spread(params: Params, k: jax.Array, state: Carried) -> Carried:
     """Moves the carried sand by one cell: it stays in the open share of cells, and is carried on in the covered share."""
     shares, holds, cover, over = params
-    h, gone, carried = state
-    free = None if over is None else (over[0], over[1] * carried)
-    kept, got, lost = blade.handed_on(shares, holds, carried, free)
+    free = None if over is None else (over[0], over[1] * state.carried)
+    kept, got, lost = blade.handed_on(shares, holds, state.carried, free)
     rest = truncate((1 - cover) * got)
-    return h + rest + kept, None if gone is None or lost is None else gone + lost, got - rest
+    h = state.height + rest + kept
+    return Carried(h, None if state.lost is None or lost is None else state.lost + lost, got - rest)
 
 
 def _at_rest(params: Params, k: jax.Array, state: Carried) -> jax.Array:
     """Whether no sand is being carried any more."""
-    return ~jnp.any(state[2] > 0)
+    return ~state.moves()

@@ -11,7 +11,7 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat_until
 from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import LegStep
-from jaxsand.interaction._block import Block, Moving, View, pose_ahead, rotated
+from jaxsand.interaction._block import Block, Carried, Moving, View, pose_ahead, rotated
 from jaxsand.interaction._frame import Frame, frame_of, shifted
 from jaxsand.interaction._wheel import Placed, Track
 from jaxsand.interaction.resting import bring_to_rest
@@ -19,8 +19,15 @@ from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.tools import Pose
 
-Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)
-Carried = tuple[jax.Array, jax.Array | None, jax.Array]  # heights, what was lost, and what is carried (quanta)
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AtRest:
+    """Sand that was brought to rest in a block (quanta): heights, fluxes, and what each cell lost over a rim, or None."""
+
+    height: jax.Array
+    flux: Fluxes
+    lost: jax.Array | None
 
 
 @dataclass(frozen=True)
@@ -46,8 +53,8 @@ class Touchdown(_OfWheel):
         gone = None if view.beyond is None else jnp.zeros_like(old)
         onward = Plain(_Onward(self.block), 16)
         params = (track, view, wheel.radial(track, frame, here), here)
-        (new, gone, carried), _ = repeat_until(_at_rest, onward, 2 * self.block.size, params, (old - taken, gone, taken))
-        new = new + carried
+        state, _ = repeat_until(_at_rest, onward, 2 * self.block.size, params, Carried(old - taken, gone, taken))
+        gone, new = state.lost, state.height + state.carried
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, here.cover))
         lost = self.block.lose(way, view, sand.lost, gone)
         return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge)
@@ -66,7 +73,7 @@ class _Onward:
 
 def _at_rest(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
     """Whether no sand is being carried any more."""
-    return ~jnp.any(state[2] > 0)
+    return ~state.moves()
 
 
 @dataclass(frozen=True)
@@ -86,13 +93,13 @@ class _Moved(_OfWheel):
         h: jax.Array,
         flux: Fluxes,
         taken: jax.Array,
-    ) -> Sanded:
+    ) -> AtRest:
         """The sand after what was taken up has left the wheel's new place `now`, and was brought to rest around it."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
         beside, among = wheel.sand_beside(self.block, track, view, now, h)
         guess = self.block.guess(beside.gates, among * part, flux)
         h, new = bring_to_rest(beside, track.way.rate * among * part, self.sweeps, h, guess)
-        return h, self.kept(part, new, flux), None if gone is None else gone + new[-1]
+        return AtRest(h, self.kept(part, new, flux), None if gone is None else gone + new[-1])
 
 
 @dataclass(frozen=True)
@@ -121,10 +128,11 @@ class WheelTurn(_Moved):
         before, now = (wheel.placed(self.block, track, f, first, view) for f in (frame, after))
         taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, old), 0) * at(view.holds)
         shares = wheel.turning(track, frame, before, sign)
-        new, flux, gone = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
+        state = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
         cover = jnp.maximum(before.cover, now.cover)
-        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
-        return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, state.height, cover))
+        height = self.block.back(way, view, sand.height, state.height)
+        return Moving(height, self.block.lose(way, view, sand.lost, state.lost), state.flux, edge)
 
 
 @dataclass(frozen=True)
@@ -150,8 +158,8 @@ class Roll(_Moved):
         flux = shifted(sand.flux, by) if block.follows else sand.flux
         gone = None if view.beyond is None else jnp.zeros_like(old)
 
-        def substep(i: jax.Array, state: Sanded) -> Sanded:
-            h, flux, gone = state
+        def substep(i: jax.Array, state: AtRest) -> AtRest:
+            h, flux, gone = state.height, state.flux, state.lost
             (begin, end), ahead = self._ends(track, k, i)
             before, now = (wheel.placed(block, track.at(by), _at(frame, by), first, view) for by in (begin, end))
             taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, h), 0) * at(view.holds)
@@ -161,14 +169,15 @@ class Roll(_Moved):
             part = jnp.where(still, 1, ahead / self.substep)
             flux = tuple(jnp.where(still, 0, f) for f in flux)
             shares = wheel.leaving(track, frame, now)
-            h, flux, more = self.moved(track.at(end), view, shares, now, part, h, flux, left)
-            return h, flux, gone if gone is None or more is None else gone + more
+            state = self.moved(track.at(end), view, shares, now, part, h, flux, left)
+            return replace(state, lost=gone if gone is None or state.lost is None else gone + state.lost)
 
-        new, flux, gone = lax.fori_loop(0, self.chunk, substep, (old, flux, gone))
+        state = lax.fori_loop(0, self.chunk, substep, AtRest(old, flux, gone))
         ends = self._ends(track, k, jnp.int32(0))[0][0], self._ends(track, k, jnp.int32(self.chunk - 1))[0][1]
         cover = jnp.maximum(*(wheel.placed(block, track, _at(frame, by), first, view).cover for by in ends))
-        edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, new, cover))
-        return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
+        edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, state.height, cover))
+        height = block.back(way, view, sand.height, state.height)
+        return Moving(height, block.lose(way, view, sand.lost, state.lost), state.flux, edge)
 
     def _ends(self, track: Track, k: jax.Array, i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         """How far ahead the wheel is before and after sub-step i of step k, and the distance between them (spacings)."""

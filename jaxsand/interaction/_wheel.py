@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._block import Block, First, View, Way
+from jaxsand.interaction._block import Block, Carried, First, View, Way
 from jaxsand.interaction._frame import Frame
 from jaxsand.interaction.resting import Sand
 from jaxsand.interaction.stencil import inner, outer, seen, spread
@@ -183,14 +183,11 @@ def handed_on(
     view: View,
     shares: Shares,
     wheel: Placed,
-    state: tuple[jax.Array, jax.Array | None, jax.Array],
-) -> tuple[jax.Array, jax.Array | None, jax.Array]:
+    state: Carried,
+) -> Carried:
     """Moves the carried sand by one cell, where it stays in the open share of cells and as far as there is room below the
-    rim.
-
-    The state holds heights, what was lost over a draining edge, and what is carried (quanta).
-    """
-    h, gone, carried = state
+    rim."""
+    h, gone, carried = state.height, state.lost, state.carried
     over = block.over(_under(track.way, wheel), view, h + carried)
     kept, got, there = carried, jnp.zeros_like(h), outer(carried)
     for (di, dj), part in zip(_FOUR, shares, strict=True):
@@ -203,7 +200,7 @@ def handed_on(
     got = got * at(view.holds)
     below = jnp.minimum(got, jnp.maximum(wheel.rim - h, 0))
     rest = truncate((1 - wheel.cover) * got + wheel.cover * below)
-    return lax.optimization_barrier((h + rest + kept, gone, got - rest))
+    return lax.optimization_barrier(Carried(h + rest + kept, gone, got - rest))
 
 
 def displaced(
@@ -215,13 +212,11 @@ def displaced(
     """
     gone = None if view.beyond is None else jnp.zeros_like(h)
 
-    def once(
-        _: jax.Array, state: tuple[jax.Array, jax.Array | None, jax.Array]
-    ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
+    def once(_: jax.Array, state: Carried) -> Carried:
         return handed_on(block, track, view, shares, wheel, state)
 
-    h, gone, carried = lax.fori_loop(0, _PASSES, once, (h, gone, taken))
-    return h + carried, gone
+    state = lax.fori_loop(0, _PASSES, once, Carried(h, gone, taken))
+    return state.height + state.carried, state.lost
 
 
 def sand_beside(block: Block, track: Track, view: View, wheel: Placed, h: jax.Array) -> tuple[Sand, jax.Array]:
