@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import seconds_of, timed
 from jaxsand.goals import letters as goals
 from jaxsand.planning.binary import Cell, Plan, plan
@@ -28,7 +29,7 @@ PUBLISHED = {
 Map = tuple[np.ndarray, Cell | None]
 
 
-def planning(tell: Tell) -> dict[str, list[dict[str, Any]]]:
+def planning(tell: Tell) -> dict[str, list[Row]]:
     """All tables."""
     return {
         "paper_counts": rows_of_paper(tell),
@@ -92,7 +93,7 @@ def comb(teeth: int, cells: int = 28) -> Map:
     return dig, (1, 0)
 
 
-def rows_of_letters(tell: Tell) -> list[dict[str, Any]]:
+def rows_of_letters(tell: Tell) -> list[Row]:
     """Every letter by `astar` and by `exact` (best of three runs): steps, proofs, expansions, milliseconds."""
     rows = []
     for letter in string.ascii_uppercase:
@@ -116,7 +117,7 @@ def rows_of_letters(tell: Tell) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_paper(tell: Tell) -> list[dict[str, Any]]:
+def rows_of_paper(tell: Tell) -> list[Row]:
     """The paper's counts, as published and as its search gives them here, and what `astar` expands instead."""
     rows = []
     for (letter, alpha), (nodes, steps) in PUBLISHED.items():
@@ -143,7 +144,7 @@ def rows_of_paper(tell: Tell) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_alpha(tell: Tell) -> list[dict[str, Any]]:
+def rows_of_alpha(tell: Tell) -> list[Row]:
     """The paper's search at falling alpha: nodes against steps in excess of the fewest."""
     rows = []
     for letter in "ASTR":
@@ -156,7 +157,7 @@ def rows_of_alpha(tell: Tell) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_size(tell: Tell, bound: int = 300_000) -> list[dict[str, Any]]:
+def rows_of_size(tell: Tell, bound: int = 300_000) -> list[Row]:
     """Nodes and time against the number of back-tracks (combs of 28 cells) and against the map's size (stretched letters);
     a search that gave up after `bound` expansions has no count."""
     maps = [(f"comb, {teeth} teeth", teeth, comb(teeth)) for teeth in range(1, 8)]
@@ -164,7 +165,7 @@ def rows_of_size(tell: Tell, bound: int = 300_000) -> list[dict[str, Any]]:
     rows = []
     for name, x, (dig, start) in maps:
         tell(name)
-        row: dict[str, Any] = {"name": name, "x": x, "cells": int(dig.sum()), "steps": None}
+        row: Row = {"name": name, "x": x, "cells": int(dig.sum()), "steps": None}
         for engine in ("paper", "astar", "exact"):
             began = time.perf_counter()
             found = plan(dig, start, engine=engine, bound=None if engine == "exact" else bound)
@@ -176,7 +177,7 @@ def rows_of_size(tell: Tell, bound: int = 300_000) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_hard(tell: Tell, seconds: float = 10.0) -> list[dict[str, Any]]:
+def rows_of_hard(tell: Tell, seconds: float = 10.0) -> list[Row]:
     """Larger maps within some seconds each: cells, steps, gap, seconds; sets of maps by their worst member."""
     letters = string.ascii_uppercase
     sets: dict[str, list[Map]] = {

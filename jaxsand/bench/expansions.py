@@ -3,17 +3,17 @@
 import heapq
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import timed
 from jaxsand.goals.letters import letter_map
 from jaxsand.planning.binary.frontier import Bound, layered, misdug, two_colours
 from jaxsand.planning.binary.graph import Graph, goal_only, with_margin
 
 
-def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[dict[str, Any]]:
+def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[Row]:
     """The paper's letters with a margin, and wide maps over their goal cells only: medians of some runs each.
 
     The heap runs the same bound, first in first out among equals.

@@ -22,6 +22,7 @@ from jaxsand.bench.gradient_checks import (
     relative,
     sloped,
 )
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import race
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.stroke_loss import GRADIENT, sand_loss
@@ -32,7 +33,6 @@ from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade, Bucket, Wheel
 from jaxsand.scene.window import Window
 
-Row = dict[str, Any]
 STOPS: tuple[Stop, ...] = (*(UntilStill(t) for t in (0.1, 0.03, 0.01, 1e-3, 1e-4)), *(Sweeps(n) for n in (16, 64, 256)))
 _ROUNDS = 3
 _CACHED = 16 * 32 * 32  # cells

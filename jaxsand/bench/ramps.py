@@ -2,10 +2,10 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.goals.goal import Goal
 from jaxsand.goals.surfaces import places, rested, rough_surface
 from jaxsand.planning.gradient import optimise_strokes
@@ -79,7 +79,7 @@ def bench_ramps(
     per_stroke: int = 200,
     steps: int = 30,
     seed: int = 0,
-) -> dict[str, list[dict[str, Any]]]:
+) -> dict[str, list[Row]]:
     """Each kind of strokes on each piece of earth: by search, and rising ones then by gradients.
 
     Errors are means of |height - goal| in mm, where the goal counts. A search has `per_stroke` pushes to each stroke, and
@@ -99,7 +99,7 @@ def bench_ramps(
     return {"ramp": rows, "ramp_maps": maps}
 
 
-def shown(maps: list[dict[str, Any]]) -> list[tuple[str, Scene, dict[str, np.ndarray], np.ndarray]]:
+def shown(maps: list[Row]) -> list[tuple[str, Scene, dict[str, np.ndarray], np.ndarray]]:
     """Of each piece of earth that `bench_ramps` tells of: its name, scene, maps by name, and the way up its middle (m)."""
     known = {work.name: work for work in works()}
     y = sum(_SIDES) / 2
@@ -114,7 +114,7 @@ def shown(maps: list[dict[str, Any]]) -> list[tuple[str, Scene, dict[str, np.nda
     return found
 
 
-def _row(work: Work, kind: str, size: tuple[int, int, int], seed: int, tell: Tell) -> tuple[dict[str, Any], np.ndarray]:
+def _row(work: Work, kind: str, size: tuple[int, int, int], seed: int, tell: Tell) -> tuple[Row, np.ndarray]:
     """The row of one kind of strokes, with so many strokes, pushes for each, and steps of gradients; and what they leave."""
     kinds: dict[str, Actions] = {
         "one depth": Flat(lowest=-work.depth, highest=-work.depth),

@@ -36,7 +36,7 @@ from jaxsand.bench import (
 from jaxsand.bench import strokes as strokebench
 from jaxsand.bench.letters import bench_letters
 from jaxsand.bench.rivals.plain import compile_c, settle_numpy
-from jaxsand.bench.tables import as_table
+from jaxsand.bench.tables import Row, as_table
 from jaxsand.bench.timing import race
 from jaxsand.interaction.simulate import act
 from jaxsand.relaxation.batching import cores
@@ -62,7 +62,7 @@ def bench(
     grids: int = 3,
     seed: int = 0,
     **strokes: Any,
-) -> dict[str, Any]:
+) -> Row:
     """The figures for `what`: settle, push, plan, or all of these; env, grad, calibrate, sand, strokes, trench,
     stability, letters, ramp, or tasks.
 
@@ -71,7 +71,7 @@ def bench(
     `tasks.bench_tasks`.
     """
     larger, batch = batch, batch or {"grad": 64, "env": 1024}.get(what, 4096)
-    report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
+    report: Row = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
         report["chunks"] = analysis.chunks(*_pushed(batch), tell)
@@ -133,7 +133,7 @@ class Settler:
     cores: int = 1
 
 
-def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 64) -> list[dict[str, Any]]:
+def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 64) -> list[Row]:
     """Settling maps in which a random push has just ended.
 
     `error` is the largest distance, over the first maps, of the settled map from the limit of small steps (float64, rate
@@ -211,7 +211,7 @@ def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 
     return rows
 
 
-def table(report: dict[str, Any]) -> str:
+def table(report: Row) -> str:
     """The report as text."""
     lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
     for what, rows in report.items():
@@ -220,7 +220,7 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _compare(rows: list[dict[str, Any]], rival: str, figure: str, name: str, *, inverse: bool = False) -> None:
+def _compare(rows: list[Row], rival: str, figure: str, name: str, *, inverse: bool = False) -> None:
     """Adds to every row how many times better its figure is than the rival's."""
     base = next((row[figure] for row in rows if row["name"] == rival), None)
     if base is not None:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.goals.metrics import volume_error
 from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.simulate import rollout
@@ -114,7 +115,7 @@ def _structures(base: SettlingCase) -> Iterator[SettlingCase]:
 
 def stability(
     largest: int = 1024, pushes: int = 100_000, tell: Tell = quiet, only: Callable[[SettlingCase], bool] = lambda _: True
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """One row for each case and dtype, and one for `pushes` random pushes in a row (none for 0). `only` picks cases.
 
     `residual` is the largest slope in excess of repose, `rounding` the slope that one quantum of the largest height makes
@@ -132,7 +133,7 @@ def stability(
     return rows
 
 
-def _row(case: SettlingCase, dtype: str) -> dict[str, Any]:
+def _row(case: SettlingCase, dtype: str) -> Row:
     height = case.height.astype(dtype)
     others = True
     began = time.perf_counter()
@@ -219,7 +220,7 @@ def _column(side: int) -> np.ndarray:
     return np.where(x[:, None] ** 2 + x**2 <= (side / 4) ** 2, side / 4 * _DX, 0)
 
 
-def _pushing(pushes: int, tell: Tell, at_once: int = 1000) -> dict[str, Any]:
+def _pushing(pushes: int, tell: Tell, at_once: int = 1000) -> Row:
     """Random pushes of the default blade from anywhere to anywhere on 32 x 32 cells, at first level, in float32."""
     began = time.perf_counter()
     scene = usual_scene()

@@ -11,13 +11,13 @@ import numpy as np
 
 from jaxsand.bench.rivals.strokes import RIVALS, BestFound
 from jaxsand.bench.stroke_goals import GOALS, StrokeGoal
+from jaxsand.bench.tables import Row
 from jaxsand.planning.gradient import first, print_of, search
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import reordered
 from jaxsand.planning.stroke_loss import Best, SandLoss
 from jaxsand.scene.progress import Tell, quiet
 
-Row = dict[str, Any]
 Method = Callable[[SandLoss, int, np.ndarray, int, int], BestFound]
 BUDGETS = (1_000, 4_000, 16_000, 64_000)
 REACHED = 0.8
