@@ -3,8 +3,8 @@ can have, and of a cone that is known exactly, beside the error that is stated."
 
 import math
 from functools import partial
-from typing import Any
 
+import jax
 import numpy as np
 
 from jaxsand.bench.tables import Row
@@ -134,7 +134,7 @@ def _found(true: Scene, guess: Scene, before: np.ndarray, seed: int) -> tuple[fl
     return math.degrees(found.values["repose_angle"]), math.degrees(found.noise_errors["repose_angle"])
 
 
-def _after(scene: Scene, before: np.ndarray, stroke: np.ndarray | None, push: PushRule | None) -> Any:
+def _after(scene: Scene, before: np.ndarray, stroke: np.ndarray | None, push: PushRule | None) -> jax.Array:
     return settle(scene, before).height if stroke is None else step(scene, before, stroke, push=push).height
 
 

@@ -6,14 +6,13 @@ The counterpart of "order of complexity" in arXiv:1908.02745, and the maps that 
 import string
 import time
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import seconds_of, timed
 from jaxsand.goals import letters as goals
-from jaxsand.planning.binary import Cell, Plan, plan
+from jaxsand.planning.binary import Cell, Engine, Plan, plan
 from jaxsand.planning.binary.paper import ALPHA
 from jaxsand.scene.progress import Tell
 
@@ -210,6 +209,6 @@ def rows_of_hard(tell: Tell, seconds: float = 10.0) -> list[Row]:
     return rows
 
 
-def _timed(dig: np.ndarray, start: Cell | None, engine: Any) -> tuple[Plan, float]:
+def _timed(dig: np.ndarray, start: Cell | None, engine: Engine) -> tuple[Plan, float]:
     took = timed(partial(plan, dig, start, engine=engine), 2)
     return took.result, 1e3 * min(took.first, took.best)

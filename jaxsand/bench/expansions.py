@@ -4,6 +4,7 @@ import heapq
 from collections.abc import Callable
 from functools import partial
 
+import jax
 import numpy as np
 
 from jaxsand.bench.tables import Row
@@ -102,5 +103,5 @@ def heap_two_colours(graph: Graph) -> tuple[int, int]:
             heapq.heappush(queue, (g + h, order, g, j, rest))
 
 
-def _bits(words: np.ndarray) -> int:
+def _bits(words: np.ndarray | jax.Array) -> int:
     return sum(int(word) << (32 * i) for i, word in enumerate(words))

@@ -4,7 +4,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +38,7 @@ class SettlingCase:
     name: str
     height: np.ndarray
     scheme: Scheme
-    angle: Any = _ANGLE
+    angle: float | np.ndarray = _ANGLE
     spacing: float = _DX
     neighbours: Neighbours = 8
     solid: np.ndarray | None = None
