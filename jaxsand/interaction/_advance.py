@@ -7,7 +7,7 @@ each is differentiated by JAX but for the sand's coming to rest, whose derivativ
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -68,8 +68,25 @@ class SubStep:
     taken: jax.Array
 
 
+class LegParams(Protocol):
+    """What a step of a leg depends on."""
+
+    @property
+    def length(self) -> jax.Array:
+        """Length of the leg (spacings)."""
+
+    @property
+    def angle(self) -> jax.Array:
+        """Angle by which the tool turns in place before the leg (rad)."""
+
+
+L = TypeVar("L", bound=LegParams)
+Floats = tuple[jax.Array, ...]  # the floating-point leaves of a leg, or cotangents of them
+StepRecord = Moving | tuple[jax.Array, Fluxes]  # the sand before a step, or the heights and fluxes of its block
+
+
 @dataclass(frozen=True)
-class LegStep:
+class LegStep(Generic[L]):
     """A step of a loop that computes a batch in the last axis; see while_loop.py."""
 
     block: Block
@@ -85,25 +102,25 @@ class LegStep:
         """The fluxes to start from after a sub-step that is the share `part` of a whole one, whose fluxes are `flux`."""
         return tuple(f + (1 - part) * b for f, b in zip(flux, before, strict=True)) if self.keeps else flux
 
-    def work(self, way: Way) -> jax.Array:
+    def work(self, leg: L) -> jax.Array:
         """How far the step leads: what its number of repetitions grows with."""
-        return way.length + jnp.abs(way.angle)
+        return leg.length + jnp.abs(leg.angle)
 
-    def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, leg: L, k: jax.Array, sand: Moving, /) -> Moving:
         raise NotImplementedError
 
-    def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, Any]:
-        return self(way, k, sand), sand
+    def recorded(self, leg: L, k: jax.Array, sand: Moving, /) -> tuple[Moving, StepRecord]:
+        return self(leg, k, sand), sand
 
-    def jvp(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
-        return Plain(self).jvp(way, k, record, dway, dsand)
+    def jvp(self, leg: L, k: jax.Array, record: StepRecord, dleg: Floats, dsand: Moving, /) -> Moving:
+        return Plain(self).jvp(leg, k, record, dleg, dsand)
 
-    def vjp(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
-        return Plain(self).vjp(way, k, record, cotangent)
+    def vjp(self, leg: L, k: jax.Array, record: StepRecord, cotangent: Moving, /) -> tuple[Floats, Moving]:
+        return Plain(self).vjp(leg, k, record, cotangent)
 
 
 @dataclass(frozen=True)
-class Advance(LegStep):
+class Advance(LegStep[Way]):
     """So many sub-steps ahead, `chunk` of them within a spacing, in a block around where they lead.
 
     If the blade has just come down, the first step lets the sand come to rest around it.
@@ -115,14 +132,14 @@ class Advance(LegStep):
     lowered: bool = False
     rest: Rest = bring_to_rest
 
-    def done(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
+    def done(self, way: Way, k: jax.Array, _: Moving) -> jax.Array:
         gone = (k - int(self.lowered)).astype(way.length.dtype) * (self.chunk * self.substep)
         return (k >= int(self.lowered)) & jnp.all(gone >= way.length)
 
     def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
         return self.recorded(way, k, sand)[0]
 
-    def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, Any]:
+    def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, StepRecord]:
         frame = frame_of(self.block.shape, way.start)
         first, by = self.block_of(way, frame, k)
         view, old = self.block.view(way, frame, first, sand.height)
@@ -256,14 +273,14 @@ class Advance(LegStep):
         past = jnp.where(way.rise > 0, jnp.minimum(behind, by), 0)
         return (way.bottom + (by - past) * way.rise) / way.quantum
 
-    def jvp(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
+    def jvp(self, way: Way, k: jax.Array, record: StepRecord, dway: Floats, dsand: Moving) -> Moving:
         if isinstance(record, Moving):
             return super().jvp(way, k, record, dway, dsand)
         inside = _Inside(self, way, k, record)
         block = cut(inside.where, dsand.height, 0.0) / way.quantum
         flux = shifted(dsand.flux, inside.by) if self.block.follows else dsand.flux
 
-        def whole(floats: Any, h: jax.Array, flux: Fluxes) -> Any:
+        def whole(floats: Floats, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
             rate = inside.rate(floats, h)
             return lax.fori_loop(0, self.chunk, lambda i, state: inside.substep(floats, rate, i, *state), (h, flux))
 
@@ -271,7 +288,7 @@ class Advance(LegStep):
         height = paste(inside.where, dsand.height, block * at(inside.holds) * way.quantum)
         return Moving(height, None, flux, dsand.edge)
 
-    def vjp(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
+    def vjp(self, way: Way, k: jax.Array, record: StepRecord, cotangent: Moving) -> tuple[Floats, Moving]:
         if isinstance(record, Moving):
             return super().vjp(way, k, record, cotangent)
         inside = _Inside(self, way, k, record)
@@ -299,22 +316,22 @@ class _Inside:
     def _view(self, way: Way) -> View:
         return View(self.where, self.holds, way.drop / way.quantum, None, None)
 
-    def rate(self, floats: Any, h: jax.Array) -> jax.Array:
+    def rate(self, floats: Floats, h: jax.Array) -> jax.Array:
         way = self.merge(floats)
         return self.advance.felt(way, self.k, self.first, self._view(way), h)[1]
 
-    def disturbed(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Disturbed:
+    def disturbed(self, i: jax.Array, floats: Floats, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Disturbed:
         way = self.merge(floats)
         view = self._view(way)
         state = InBlock(h, flux, self.advance.block.clear(view))
         return self.advance.disturbed(way, rate, self.k, self.first, view, i, state)[0]
 
-    def substep(self, floats: Any, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
+    def substep(self, floats: Floats, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
         disturbed = self.disturbed(i, floats, rate, h, flux)
         h, new = bring_to_rest(disturbed.sand, disturbed.rate, self.advance.sweeps, disturbed.height, disturbed.guess)
         return h, self.advance.kept(disturbed.part, new, flux)
 
-    def vjp(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Any, jax.Array, Fluxes]:
+    def vjp(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Floats, jax.Array, Fluxes]:
         """The cotangents of the floats, the heights and the fluxes: from the last sub-step backwards, made again."""
         chunk, sweeps, floats = self.advance.chunk, self.advance.sweeps, self.floats
         rate, to_rate = jax.vjp(self.rate, floats, self.state[0])
@@ -351,7 +368,7 @@ class _Inside:
         return jax.tree.map(jnp.add, of_floats, df), dh + more, dflux
 
     def _depends(
-        self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes
+        self, i: jax.Array, floats: Floats, rate: jax.Array, h: jax.Array, flux: Fluxes
     ) -> tuple[tuple[Rested, Fluxes], Sand]:
         """What the sand's coming to rest depends on, the fluxes that are kept beside its own, and the sand."""
         disturbed = self.disturbed(i, floats, rate, h, flux)

@@ -8,7 +8,7 @@ l its length. A sweep adds G (rate g e / l) to the heights; see flux_adjoint.py.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jaxsand.scene.grid import links
 
 Params: TypeAlias = tuple[Bed, Flow, ToolInSand]
 State: TypeAlias = tuple[jax.Array, ExactSum | None]
+Carry: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array], jax.Array, jax.Array]
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def vjp(bed: Bed, flow: Flow, tool: ToolInSand, tape: jax.Array, cotangent: jax.
     most = flux_adjoint.yields(bed)
     per_cell = bool(bed.drop.ndim)
 
-    def stage(j: jax.Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+    def stage(j: jax.Array, carry: Carry) -> Carry:
         gain, excess, tilt, lift, moved = carry
         s = halo(lax.dynamic_index_in_dim(tape, sweeps - 1 - j, keepdims=False))
         rises = flux_adjoint.steps(bed, s)

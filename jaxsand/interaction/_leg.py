@@ -47,7 +47,7 @@ class LegSteps:
         bound: largest length of a leg (spacings).
     """
 
-    lower: LegStep
+    lower: LegStep[Any]
     turn: Repeated
     ahead: Repeated
     bound: float

@@ -18,7 +18,7 @@ Params: TypeAlias = tuple[blade.Shares, jax.Array, jax.Array, tuple[jax.Array, j
 
 
 @dataclass(frozen=True)
-class Lower(LegStep):
+class Lower(LegStep[Way]):
     """The step in which the blade comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,20 +30,12 @@ class AtRest:
 
 
 @dataclass(frozen=True)
-class _OfWheel(LegStep):
-    """A step whose params are a wheel's track."""
-
-    def work(self, way: Any) -> jax.Array:
-        return super().work(way.way)
-
-
-@dataclass(frozen=True)
-class Touchdown(_OfWheel):
+class Touchdown(LegStep[Track]):
     """The step in which the wheel comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1
 
-    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
         way, frame = track.way, frame_of(self.block.shape, track.way.start)
         first = self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
@@ -77,7 +68,7 @@ def _at_rest(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
 
 
 @dataclass(frozen=True)
-class _Moved(_OfWheel):
+class _Moved(LegStep[Track]):
     """A step in which the wheel moves, and `sweeps` proximal steps after each sub-step bring the sand to rest around it."""
 
     substep: float = 0.125
@@ -115,7 +106,7 @@ class WheelTurn(_Moved):
         far = jnp.minimum(jnp.hypot(track.radius, track.way.side), math.hypot(*self.block.shape))
         return self.substep / far
 
-    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
         way, whole = track.way, self._part(track)
         begin = k.astype(whole.dtype) * whole
         ahead = jnp.clip(jnp.abs(way.angle) - begin, 0, whole)
@@ -150,7 +141,7 @@ class Roll(_Moved):
         steps = (k - int(self.lowered)).astype(track.way.length.dtype)
         return (k >= int(self.lowered)) & jnp.all(steps * (self.chunk * self.substep) >= track.way.length)
 
-    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
         way, block = track.way, self.block
         frame = frame_of(block.shape, way.start)
         first, by = block.ahead(frame, way.length, k - int(self.lowered), self.chunk * self.substep)

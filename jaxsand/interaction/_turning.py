@@ -16,7 +16,7 @@ from jaxsand.relaxation.ghost_cells import at
 
 
 @dataclass(frozen=True)
-class BladeTurn(LegStep):
+class BladeTurn(LegStep[Way]):
     """A sub-step of a turn in place, which moves the blade's corners by `substep` spacings."""
 
     substep: float = 0.125

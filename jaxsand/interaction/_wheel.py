@@ -56,6 +56,16 @@ class Track:
         level = self.way.rise is None and self.way.relief is None
         return self if level else replace(self, way=self.way.at(by))
 
+    @property
+    def length(self) -> jax.Array:
+        """Length of the leg (spacings)."""
+        return self.way.length
+
+    @property
+    def angle(self) -> jax.Array:
+        """Angle by which the wheel turns in place before the leg (rad)."""
+        return self.way.angle
+
     def seen(self, frame: Frame) -> jax.Array:
         """The slip angle in a frame, where a mirror changes its sign."""
         return frame.mirrors(self.slip)
