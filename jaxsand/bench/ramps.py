@@ -15,6 +15,7 @@ from jaxsand.planning.stroke_loss import GRADIENT
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
+from jaxsand.viz.side import Side
 
 _SHAPE, _SPACING = (16, 32), 0.02
 _START, _END, _SIDES = 0.18, 0.48, (0.08, 0.24)  # of the ramp and the pad (m)
@@ -99,8 +100,8 @@ def bench_ramps(
     return {"ramp": rows, "ramp_maps": maps}
 
 
-def shown(maps: list[Row]) -> list[tuple[str, Scene, dict[str, np.ndarray], np.ndarray]]:
-    """Of each piece of earth that `bench_ramps` tells of: its name, scene, maps by name, and the way up its middle (m)."""
+def shown(maps: list[Row]) -> list[Side]:
+    """Each piece of earth that `bench_ramps` tells of, with its maps along the way up its middle."""
     known = {work.name: work for work in works()}
     y = sum(_SIDES) / 2
     found = []
@@ -110,7 +111,7 @@ def shown(maps: list[Row]) -> list[tuple[str, Scene, dict[str, np.ndarray], np.n
         middle = np.nanmin(work.goal), np.nanmax(work.goal)
         rise = (middle[1] - middle[0]) / (_END - _START - _SPACING)
         ends = ((x, y, float(np.nanmean(work.goal)) + rise * (x - (_START + _END) / 2)) for x in (_START, _END))
-        found.append((work.name, work.scene, some, np.array([*ends])))
+        found.append(Side(work.name, work.scene, some, np.array([*ends])))
     return found
 
 
