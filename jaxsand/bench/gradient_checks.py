@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsand.interaction.bucket import dump, load_volume, scoop
 from jaxsand.interaction.simulate import act, step
-from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.settling import Settled, settle
 from jaxsand.relaxation.stopping import Stop, Sweeps
 from jaxsand.scene.boundaries import Base, Deep
 from jaxsand.scene.grid import Neighbours
@@ -19,7 +19,7 @@ from jaxsand.scene.scene import Scene, cast, make_scene
 from jaxsand.scene.tools import Blade, Bucket, Tool, Wheel
 from jaxsand.scene.window import Window
 
-Inputs = tuple[Any, Any, Any]
+Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Heights [B, H, W] (m), strokes [B, 4] or [B, 6] (m) and angles of repose [B] (rad)."""
 
 SPACING = 0.01
@@ -74,11 +74,13 @@ def program(case: GradientCase, cells: int) -> Callable[..., Any]:
     that settling took."""
     weights = np.random.default_rng(9).standard_normal((cells, cells))
 
-    def run(height: Any, stroke: Any, angle: Any, stop: Stop | None = case.stop) -> tuple[Any, Any]:
+    def run(
+        height: jax.Array, stroke: jax.Array, angle: jax.Array, stop: Stop | None = case.stop
+    ) -> tuple[jax.Array, jax.Array]:
         of: Any = {"neighbours": case.neighbours}
         if case.pushes:
             scene = make_scene((cells, cells), SPACING, angle, tool=case.tool, window=case.window, base=case.base, **of)
-            after: Any = _worked(scene, height, stroke, stop)
+            after = _worked(scene, height, stroke, stop)
         else:
             after = settle(make_scene((cells, cells), SPACING, angle, **of), height, stop=stop, window=case.window)
         return jnp.sum(jnp.asarray(weights, after.height.dtype) * after.height), after.sweeps
@@ -86,7 +88,7 @@ def program(case: GradientCase, cells: int) -> Callable[..., Any]:
     return run
 
 
-def _worked(scene: Scene, height: Any, stroke: Any, stop: Stop | None) -> Any:
+def _worked(scene: Scene, height: jax.Array, stroke: jax.Array, stop: Stop | None) -> Settled:
     """A push; of a bucket a scoop, and a dump of 0.6 of what it took up where the scoop ended."""
     if not isinstance(scene.tool, Bucket):
         return step(scene, height, stroke, stop=stop)
@@ -207,7 +209,8 @@ def _gradient(case: GradientCase, cells: int) -> Callable[..., Any]:
 
 @cache
 def _act_program() -> Callable[..., Any]:
-    def one(height: Any, stroke: Any, angle: Any) -> Any:
-        return act(make_scene(height.shape, SPACING, angle, tool=Blade()), height, stroke).height
+    def one(height: jax.Array, stroke: jax.Array, angle: jax.Array) -> jax.Array:
+        rows, columns = height.shape
+        return act(make_scene((rows, columns), SPACING, angle, tool=Blade()), height, stroke).height
 
     return jax.jit(jax.vmap(one))
