@@ -10,12 +10,15 @@ must not change a map that is done, and its `done` returns one boolean for all m
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
+
+if TYPE_CHECKING:
+    from jaxsand.autodiff.while_loop import Step, TrailingStep
 
 Tree = Any
 Done = Callable[[Tree, jax.Array, Tree], jax.Array]
@@ -29,14 +32,14 @@ class Loop:
 
     Attributes:
         done: whether a map stops before step k; None where all take `bound` steps.
-        step: a `while_loop.Step`.
+        step: the step; a `TrailingStep` if it computes a batch in the last axis.
         bound: largest number of steps.
         batch_axes: number of leading batch axes of the state.
         width: size of the trailing batch, 0 where there is none.
     """
 
     done: Done | None
-    step: Any
+    step: "Step"
     bound: int
     batch_axes: int
     width: int = 0
@@ -105,7 +108,7 @@ class Loop:
 class _Many:
     """A step with one more leading batch axis."""
 
-    def __init__(self, step: Any, axes: Tree) -> None:
+    def __init__(self, step: "Step", axes: Tree) -> None:
         self.tape = step.tape
         self.call = jax.vmap(step, in_axes=(axes, None, 0))
         self.recorded = jax.vmap(step.recorded, in_axes=(axes, None, 0))
@@ -116,7 +119,7 @@ class _Many:
         return self.call(params, k, state)
 
 
-def batched(program: Callable[..., Any], loop: Loop, params: Tree, *rest: Tree) -> Tree:
+def batched(program: Callable[..., Tree], loop: Loop, params: Tree, *rest: Tree) -> Tree:
     """`program(loop, params, *rest)`; under `vmap` the same program with one more batch axis, which all of `rest` gains."""
 
     @custom_vmap
@@ -124,7 +127,7 @@ def batched(program: Callable[..., Any], loop: Loop, params: Tree, *rest: Tree) 
         return program(loop, params, *rest)
 
     @run.def_vmap
-    def rule(size: int, mapped: list[Any], params: Tree, rest: Tree) -> tuple[Tree, Tree]:
+    def rule(size: int, mapped: list[Tree], params: Tree, rest: Tree) -> tuple[Tree, Tree]:
         if loop.trailing:
             out = _trailing(program, loop, size, mapped, (params, rest))
             return out, jax.tree.map(lambda _: True, out)
@@ -136,7 +139,7 @@ def batched(program: Callable[..., Any], loop: Loop, params: Tree, *rest: Tree) 
     return run(params, rest)
 
 
-def _trailing(program: Callable[..., Any], loop: Loop, size: int, mapped: list[Any], args: Tree) -> Tree:
+def _trailing(program: Callable[..., Tree], loop: Loop, size: int, mapped: list[Tree], args: Tree) -> Tree:
     """`program` with one more batch of `size` maps in the last axis, chunk by chunk; in the result it is the first axis.
 
     `mapped` says which leaves of `args`, the params and the rest, have the batch axis. A chunk takes as many steps as its
@@ -144,11 +147,12 @@ def _trailing(program: Callable[..., Any], loop: Loop, size: int, mapped: list[A
     """
     leaves, tree = jax.tree.flatten(args)
     yes = jax.tree.leaves(mapped)
-    chunk = min(size, loop.step.together)
+    step = cast("TrailingStep", loop.step)
+    chunk = min(size, step.together)
     chunks = -(-size // chunk)
     chunk = -(-size // chunks)
 
-    def one_chunk(part: list[Any]) -> Tree:
+    def one_chunk(part: list[jax.Array]) -> Tree:
         own = iter(part)
 
         def batch_last(x: jax.Array, batched: bool) -> jax.Array:
@@ -172,7 +176,7 @@ def _trailing(program: Callable[..., Any], loop: Loop, size: int, mapped: list[A
     order = place = jnp.arange(size)
     if loop.done is not None:
         axes = jax.tree.map(lambda y: 0 if y else None, mapped[0])
-        work = jax.vmap(loop.step.work, in_axes=(axes,), axis_size=size)(args[0])
+        work = jax.vmap(step.work, in_axes=(axes,), axis_size=size)(args[0])
         order = jnp.argsort(jnp.max(work.reshape(size, -1), axis=1))
         place = jnp.argsort(order)
     order = jnp.concatenate([order, jnp.broadcast_to(order[-1:], (extra,))])

@@ -45,6 +45,19 @@ class Step(Protocol):
         """The vjp: the cotangents of params and of the state before step k, from that of the state after."""
 
 
+class TrailingStep(Step, Protocol):
+    """A step that computes a batch by itself, in the last axis of all arrays; see _batched_while.py."""
+
+    trailing: bool
+
+    @property
+    def together(self) -> int:
+        """The number of maps that are computed at a time, at most."""
+
+    def work(self, params: Tree, /) -> jax.Array:
+        """A number that grows with the steps that a map takes."""
+
+
 @dataclass(frozen=True)
 class Plain:
     """A step that records the state before it, and is differentiated by JAX.
