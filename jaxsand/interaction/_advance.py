@@ -82,7 +82,8 @@ class LegParams(Protocol):
 
 L = TypeVar("L", bound=LegParams)
 Floats = tuple[jax.Array, ...]  # the floating-point leaves of a leg, or cotangents of them
-StepRecord = Moving | tuple[jax.Array, Fluxes]  # the sand before a step, or the heights and fluxes of its block
+BlockSand = tuple[jax.Array, Fluxes]  # heights and fluxes of a block
+StepRecord = Moving | BlockSand  # the sand before a step, or that of its block
 
 
 @dataclass(frozen=True)
@@ -331,12 +332,12 @@ class _Inside:
         h, new = bring_to_rest(disturbed.sand, disturbed.rate, self.advance.sweeps, disturbed.height, disturbed.guess)
         return h, self.advance.kept(disturbed.part, new, flux)
 
-    def vjp(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Floats, jax.Array, Fluxes]:
+    def vjp(self, cotangent: BlockSand) -> tuple[Floats, jax.Array, Fluxes]:
         """The cotangents of the floats, the heights and the fluxes: from the last sub-step backwards, made again."""
         chunk, sweeps, floats = self.advance.chunk, self.advance.sweeps, self.floats
         rate, to_rate = jax.vjp(self.rate, floats, self.state[0])
 
-        def again(i: jax.Array, carry: Any) -> Any:
+        def again(i: jax.Array, carry: tuple[BlockSand, BlockSand]) -> tuple[BlockSand, BlockSand]:
             state, tape = carry
             tape = jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, i, 0), tape, state)
             return self.substep(floats, rate, i, *state), tape
@@ -344,7 +345,7 @@ class _Inside:
         tape = jax.tree.map(lambda x: jnp.zeros((chunk, *x.shape), x.dtype), self.state)
         _, tape = lax.fori_loop(0, chunk, again, (self.state, tape))
 
-        def fetched(i: jax.Array) -> Any:
+        def fetched(i: jax.Array) -> BlockSand:
             return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, i, 0, keepdims=False), tape)
 
         def back(j: jax.Array, carry: Any) -> Any:

@@ -1,7 +1,6 @@
 """The block of the map around a tool: how it is read and written back, and how the sand in it stands."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -254,7 +253,7 @@ class Block:
         """
         if not self.follows:
             return jnp.zeros_like(way.length)
-        near: Any = False
+        near: jax.Array | bool = False
         for axis, begin, cells in zip((1, 0), first, frame.extent(), strict=True):
             i = numbers(self.size, axis, begin)
             near = near | ((i < SPARE) & (begin > 0)) | ((i >= self.size - SPARE) & (begin + self.size < cells))

@@ -178,7 +178,7 @@ def steepest(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Float[Array, ""]:
 
 def _highest(maps: Iterable[jax.Array]) -> jax.Array:
     """The largest value in any of the maps, at least 0; NaN marks a missing link and is ignored."""
-    worst: Any = 0.0
+    worst: jax.Array | float = 0.0
     for e in maps:
         worst = jnp.where(e > worst, e, worst)
     return jnp.max(jnp.max(worst, axis=0))  # rows first: XLA vectorises that
