@@ -12,8 +12,16 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxsand import env as env
+    from jaxsand import forces as forces
+    from jaxsand import gym as gym
+    from jaxsand import task as task
+    from jaxsand import tasks as tasks
+    from jaxsand import trench as trench
     from jaxsand.envs import make as make
     from jaxsand.goals.drawing import read_drawing as read_drawing
+    from jaxsand.goals.feasible import AtBest as AtBest
+    from jaxsand.goals.feasible import at_best as at_best
     from jaxsand.goals.goal import Goal as Goal
     from jaxsand.interaction._path import Pushed as Pushed
     from jaxsand.interaction.batched import step_batch as step_batch
@@ -96,6 +104,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "AsNeeded": "scene.window",
+    "AtBest": "goals.feasible",
     "Base": "scene.boundaries",
     "Blade": "scene.tools",
     "Blurred": "planning.gradient",
@@ -150,6 +159,7 @@ _HOMES = {
     "Whole": "scene.window",
     "Window": "scene.window",
     "act": "interaction.simulate",
+    "at_best": "goals.feasible",
     "calibrate": "terramechanics.calibration",
     "calibrate_sections": "terramechanics.sections",
     "check": "interaction.outcome",
@@ -179,15 +189,17 @@ __all__ = [*_HOMES]
 _OTHER_NAMES = ("env", "forces", "gym", "task", "tasks", "trench")  # modules
 
 
-def __getattr__(name: str) -> Any:
-    """The public object of this name, imported now."""
-    if name == "__version__":
-        return metadata.version("jaxsand")
-    if name in _OTHER_NAMES:
-        return import_module(f"jaxsand.{name}")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'jaxsand' has no attribute {name!r}")
-    return getattr(import_module(f"jaxsand.{_HOMES[name]}"), name)
+if not TYPE_CHECKING:  # a type checker that saw this would let every misspelt name pass
+
+    def __getattr__(name: str) -> Any:
+        """The public object of this name, imported now."""
+        if name == "__version__":
+            return metadata.version("jaxsand")
+        if name in _OTHER_NAMES:
+            return import_module(f"jaxsand.{name}")
+        if name not in _HOMES:
+            raise AttributeError(f"module 'jaxsand' has no attribute {name!r}")
+        return getattr(import_module(f"jaxsand.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

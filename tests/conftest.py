@@ -18,6 +18,12 @@ ANGLE = math.radians(29)
 MU = math.tan(ANGLE)
 
 
+def rough(seed: int, span: float, cells: int = 20) -> np.ndarray:
+    """A smooth random surface of `cells` x `cells` from 0 to `span` (m)."""
+    walk = np.cumsum(np.cumsum(np.random.default_rng(seed).normal(size=(cells, cells)), 0), 1)
+    return span * (walk - walk.min()) / np.ptp(walk)
+
+
 ROOM = 30_000  # of the 65,530 pieces of memory that Linux lets a process map, of which every program takes some
 HURRY = {
     "xla_cpu_use_fusion_emitters": False,

@@ -91,6 +91,29 @@ def test_a_path(kind):
     gradient(lambda h, s: js.follow(sand, h, s, push=QUICK, stop=STOP), MAP, PATH)
 
 
+BUCKET = {"tool": js.Bucket(0.03, 0.02, 1e-5), "base": js.Base(-0.02)}
+
+
+@pytest.mark.parametrize("pour", [js.deposit, js.remove])
+def test_sand_put_down_and_taken_away(pour):
+    sand = scene(BUCKET)
+    clean(pour(sand, MAP, np.float32([0.041, 0.037]), 1e-6, stop=STOP))
+
+
+@pytest.mark.wide
+def test_sand_over_a_footprint_has_gradients():
+    gradient(lambda h, v: js.deposit(scene(PLAIN), h, np.ones((8, 8), "float32"), v, stop=STOP), MAP, np.float32(1e-6))
+
+
+@pytest.mark.wide
+def test_a_bucket():
+    sand = scene(BUCKET)
+    loaded = js.scoop(sand, MAP, np.float32([[0.02, 0.025], [0.05, 0.045]]), push=QUICK, stop=STOP)
+    clean(loaded)
+    assert float(js.load_volume(sand, loaded.load)) > 0
+    clean(js.dump(sand, loaded.height, np.float32([[0.04, 0.04]]), loaded.load, stop=STOP))
+
+
 @SLOW
 def test_entry_points():
     sand, ways = scene(DRAINED), {"push": QUICK, "stop": STOP}

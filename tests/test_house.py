@@ -1,9 +1,16 @@
 """The house's own rules: what may be imported where, and what its public names say."""
 
 import ast
+import inspect
+import os
 import re
+import subprocess
+import sys
 from collections import defaultdict
+from importlib.util import find_spec
 from pathlib import Path
+
+import pytest
 
 import jaxsand
 
@@ -57,8 +64,52 @@ def test_what_type_checkers_see_is_what_is_there():
     tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
     block = next(node for node in tree.body if isinstance(node, ast.If))
     seen = {a.asname: f"{node.module}" for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
-    assert seen == {name: f"jaxsand.{home}" for name, home in jaxsand._HOMES.items()}
+    modules = {name for name, home in seen.items() if home == "jaxsand"}
+    assert sorted(modules) == sorted(jaxsand._OTHER_NAMES)
+    homes = {name: f"jaxsand.{home}" for name, home in jaxsand._HOMES.items()}
+    assert seen == homes | dict.fromkeys(modules, "jaxsand")
+    assert not any(isinstance(node, ast.FunctionDef) and node.name == "__getattr__" for node in tree.body)
     assert jaxsand.__version__[0].isdigit()
+
+
+@pytest.mark.slow
+def test_misspelt_names_do_not_pass_type_checkers(tmp_path):
+    pytest.importorskip("mypy")
+    (tmp_path / "user.py").write_text(
+        "import jaxsand as js\nreveal_type(js.step)\nreveal_type(js.task.iou)\njs.stpe\njs.task.iuo\njs.settle(0)\n"
+    )
+    command = [sys.executable, "-m", "mypy", "--config-file=", "--ignore-missing-imports", "--follow-imports=silent"]
+    environment = os.environ | {"MYPYPATH": str(PACKAGE.parent)}
+    done = subprocess.run(
+        [*command, f"--cache-dir={tmp_path / 'cache'}", "user.py"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    told = {int(line.split(":")[1]): line for line in done.stdout.splitlines() if line.startswith("user.py:")}
+    assert "def (scene: jaxsand.scene.scene.Scene" in told[2]
+    assert 'Revealed type is "def (' in told[3]
+    assert 'has no attribute "stpe"' in told[4]
+    assert 'has no attribute "iuo"' in told[5]
+    assert 'expected "Scene"' in told[6]
+
+
+def test_aliases_hold_what_they_say_and_no_more():
+    """Nothing that their homes import, such as numpy, is offered under the package's own names."""
+    for alias in ("env", "forces", "task", "tasks", "trench", *(["gym"] if find_spec("gymnasium") else [])):
+        module = getattr(jaxsand, alias)
+        scope = {}
+        exec(f"from jaxsand.{alias} import *", scope)
+        names = set(scope) - {"__builtins__"}
+        home = sys.modules["jaxsand.envs" if alias == "env" else "jaxsand.terramechanics.forces"]
+        assert names == set(getattr(module, "__all__", home.__all__)), alias
+        for name in names:
+            value = getattr(module, name)
+            assert not inspect.ismodule(value), f"{alias}.{name}"
+            assert getattr(value, "__module__", "jaxsand").startswith(("jaxsand", "builtins")), f"{alias}.{name}"
+        assert {name for name in vars(module) if not name.startswith("_")} == names, alias
 
 
 def test_no_module_hides_a_public_function():
@@ -68,6 +119,20 @@ def test_no_module_hides_a_public_function():
 def test_public_functions_say_what_they_do():
     for name in jaxsand.__all__:
         assert getattr(jaxsand, name).__doc__, name
+
+
+def without_docstrings(node, prefix=""):
+    """The functions in a module or class that bear no underscore, and say nothing of what they do."""
+    for part in node.body:
+        if isinstance(part, ast.ClassDef) and not part.name.startswith("_"):
+            yield from without_docstrings(part, f"{prefix}{part.name}.")
+        if isinstance(part, ast.FunctionDef) and not part.name.startswith("_") and not ast.get_docstring(part):
+            yield from [] if any("overload" in ast.unparse(d) for d in part.decorator_list) else [prefix + part.name]
+
+
+def test_every_function_that_others_call_says_what_it_does():
+    for path in [*PACKAGE.rglob("*.py"), *(PACKAGE.parent / "train").rglob("*.py")]:
+        assert not [*without_docstrings(ast.parse(path.read_text(encoding="utf-8")))], path
 
 
 def test_nothing_tells_to_run_the_learners_without_saying_where_they_are():

@@ -203,3 +203,16 @@ def test_nothing_is_fetched_from_a_network():
     assert "font: false" in settings
     assert "http" not in settings
     assert not re.search(r"<(script|link|img|iframe)[^>]*http", "\n".join(p.read_text(encoding="utf-8") for p in PAGES))
+
+
+def test_derivations_that_the_code_points_to_are_there():
+    """A module names a page of the theory, and in brackets and quotes the headings that it means."""
+    told = 0
+    for path in [*(ROOT / "jaxsand").rglob("*.py")]:
+        text = " ".join(path.read_text(encoding="utf-8").split())
+        for page, said in re.findall(r"notebooks/(site/theory/[\w-]+\.md)( \([^)]*\))?", text):
+            headings = re.findall(r"^#+ (.*)$", (NOTEBOOKS / page).read_text(encoding="utf-8"), re.MULTILINE)
+            for heading in re.findall(r'"([^"]*)"', said):
+                assert heading in headings, f"{path}: {heading} of {page}"
+                told += 1
+    assert told

@@ -11,6 +11,7 @@ import jaxsand
 from jaxsand.bench.tables import as_table
 from jaxsand.cli.files import existing, folder, progress, write_json, written
 from jaxsand.cli.printing import lines, show
+from jaxsand.scene.progress import Tell
 
 if TYPE_CHECKING:
     from jaxsand.planning.learned.beam_search import Proposes
@@ -132,9 +133,7 @@ def _made(options: argparse.Namespace) -> tuple["Learner", int | None]:
     return (paper, None if options.minutes else paper.chunks(EPISODES)) if options.paper else (Ddpg(), None)
 
 
-def _on_sand(
-    policy: "Proposes", options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
-) -> dict[str, Any]:
+def _on_sand(policy: "Proposes", options: argparse.Namespace, tell: Tell, out: Path | None) -> dict[str, Any]:
     """Evaluates a policy on glyphs, and writes report and picture if asked."""
     from jaxsand.planning.learned.stages import Stages
     from train.evaluation.glyphs import SETS, read_glyphs
@@ -154,9 +153,7 @@ def _on_sand(
     return report
 
 
-def _on_maps(
-    learner: "Dqn", state: "Walking", options: argparse.Namespace, tell: Callable[[str], None], out: Path | None
-) -> dict[str, Any]:
+def _on_maps(learner: "Dqn", state: "Walking", options: argparse.Namespace, tell: Tell, out: Path | None) -> dict[str, Any]:
     """Evaluates a DQN on letter maps, and writes the report if asked."""
     for option in ("glyphs", "goals", "refine"):
         if getattr(options, option):

@@ -26,6 +26,8 @@ from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.stroke_loss import SandLoss, sand_loss
 from jaxsand.relaxation.stopping import check_whole
+from jaxsand.scene.grid import places
+from jaxsand.scene.progress import Tell
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
 
@@ -59,7 +61,7 @@ def peer_goals(number: int, key: int) -> list[PeerGoal]:
         low, high = corners.min(0), corners.max(0)
         room = np.array(_SHAPE[::-1]) * _SPACING - 0.04
         corners = corners - low + 0.02 + rng.random(2) * np.maximum(room - (high - low), 0)
-        y, x = (np.indices(_SHAPE) + 0.5) * _SPACING
+        x, y = places(_SHAPE, _SPACING)
         inside = Outline(corners).contains_points(np.stack([x.ravel(), y.ravel()], 1)).reshape(_SHAPE)
         scene = make_scene(_SHAPE, _SPACING, _ANGLE, tool=Blade(depth=depth))
         out.append(PeerGoal(f"{name} {k // len(makers) + 1}", scene, np.where(inside, -depth, 0.0).astype(np.float32)))
@@ -109,7 +111,7 @@ def judged(goal: PeerGoal, height: np.ndarray) -> dict[str, float]:
 
 
 def compare(
-    number: int, most: int, pushes: int, key: int, tell: Callable[[str], None], only: list[str] | None = None
+    number: int, most: int, pushes: int, key: int, tell: Tell, only: list[str] | None = None
 ) -> list[dict[str, Any]]:
     """A row for each method with means over the goals, and the published figures.
 

@@ -60,7 +60,7 @@ class Loop:
         return Loop(done, _Many(self.step, axes), self.bound, self.batch_axes + 1)
 
     def ended(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
-        """Which maps stop before step k: booleans with the leading batch axes, one for a whole trailing batch."""
+        """Which maps have ended before step k: booleans with the leading batch axes, one for a whole trailing batch."""
         over = k >= self.bound
         return over if self.done is None else over | self.done(params, k, state)
 
@@ -81,7 +81,7 @@ class Loop:
         return jnp.zeros((), bool) if count is None else k >= count
 
     def keep(self, ended: jax.Array, old: Tree, new: Tree) -> Tree:
-        """The old state of the maps that have ended, the new one of the others."""
+        """The state after a step: the old one of the maps that had ended before it, the new one of the others."""
         if not self.batch_axes or not ended.ndim:
             return new
         return jax.tree.map(
@@ -222,9 +222,9 @@ class Forward:
 
     Attributes:
         end: the last state.
-        count: the number of steps of each map, or None where all take as many.
-        tape: the record of step k in place k % room, for the last `Loop.room` steps.
-        memory: earlier states; None where there cannot be more steps than that.
+        count: the number of steps that each map took, or None where all take `Loop.bound`.
+        tape: what step k recorded in place k % `Loop.room`, for the last `Loop.room` steps.
+        memory: earlier states, or None where the tape holds every step.
     """
 
     end: Tree
@@ -234,7 +234,7 @@ class Forward:
 
 
 def record(loop: Loop, params: Tree, state: Tree) -> Forward:
-    """Runs the loop for reverse mode."""
+    """Runs the loop, and keeps what reverse mode needs."""
 
     def advance(carry: Tree) -> Tree:
         state, k, count, ended, tape = carry

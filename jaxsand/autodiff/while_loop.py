@@ -74,13 +74,16 @@ class Plain:
         return self.body(params, k, state)
 
     def recorded(self, params: Tree, k: jax.Array, state: Tree) -> tuple[Tree, Tree]:
+        """The state after step k, and the state before it as the record."""
         return self.body(params, k, state), state
 
     def jvp(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree) -> Tree:
+        """The jvp, by JAX."""
         floats, merge = split(params)
         return jax.jvp(lambda f, x: self.body(merge(f), k, x), (floats, record), (dparams, dstate))[1]
 
     def vjp(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+        """The vjp, by JAX."""
         floats, merge = split(params)
         return jax.vjp(lambda f, x: self.body(merge(f), k, x), floats, record)[1](cotangent)
 

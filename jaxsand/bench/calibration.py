@@ -14,7 +14,7 @@ from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.rule import PushRule
 from jaxsand.interaction.simulate import step
 from jaxsand.relaxation.settling import settle
-from jaxsand.scene.grid import Neighbours
+from jaxsand.scene.grid import Neighbours, places
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -36,7 +36,7 @@ def bench_calibrate(tell: Tell = quiet, seeds: int = 50) -> list[Row]:
     """For three experiments in the simulator's own sand: the rms and the largest error of the angle of repose, and the rms
     of the noise's standard errors (at the optimum the Cramer-Rao bound), in degrees, over so many angles and noises.
     Strokes are swaths: the fast push."""
-    y, x = (np.indices(SHAPE) + 0.5) * SPACING
+    x, y = places(SHAPE, SPACING)
     column = np.where(np.hypot(x - 0.16, y - 0.16) < 0.06, 0.06, 0).astype(np.float32)
     experiments: dict[str, tuple[Blade | None, np.ndarray]] = {
         "a column collapses": (None, column),

@@ -1,7 +1,6 @@
 """States that A* expands a second: whole layers at once (planner/frontier.py) beside a plain heap, in one run."""
 
 import heapq
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -12,9 +11,10 @@ from jaxsand.bench.timing import timed
 from jaxsand.goals.letters import letter_map
 from jaxsand.planning.binary.frontier import Bound, layered, misdug, two_colours
 from jaxsand.planning.binary.graph import Graph, goal_only, with_margin
+from jaxsand.scene.progress import Tell
 
 
-def rows_of_expansions(tell: Callable[[str], None], repeats: int = 5) -> list[Row]:
+def rows_of_expansions(tell: Tell, repeats: int = 5) -> list[Row]:
     """The paper's letters with a margin, and wide maps over their goal cells only: medians of some runs each.
 
     The heap runs the same bound, first in first out among equals.

@@ -48,6 +48,7 @@ class GradientCase:
 
     @property
     def name(self) -> str:
+        """What the case is called in tables."""
         parts = [self._work(), f"{self.neighbours}"]
         if self.window:
             parts.append("window {} x {}".format(*self.window.size))

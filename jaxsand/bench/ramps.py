@@ -7,11 +7,12 @@ import numpy as np
 
 from jaxsand.bench.tables import Row
 from jaxsand.goals.goal import Goal
-from jaxsand.goals.surfaces import places, rested, rough_surface
+from jaxsand.goals.surfaces import rested, rough_surface
 from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Actions, Flat, Rising
 from jaxsand.planning.stroke_loss import GRADIENT
+from jaxsand.scene.grid import places
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade

@@ -38,14 +38,14 @@ from jaxsand.bench.letters import bench_letters
 from jaxsand.bench.rivals.plain import compile_c, settle_numpy
 from jaxsand.bench.tables import Row, as_table
 from jaxsand.bench.timing import race
+from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.simulate import act
 from jaxsand.relaxation.batching import cores
 from jaxsand.relaxation.schemes import Relaxation, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.progress import Tell, quiet
-from jaxsand.scene.scene import Scene, make_scene
-from jaxsand.scene.tools import Blade
+from jaxsand.scene.scene import Scene
 
 _CELLS = 32
 _SPACING = 0.01
@@ -229,12 +229,12 @@ def _compare(rows: list[Row], rival: str, figure: str, name: str, *, inverse: bo
 
 
 def _pushed(batch: int) -> tuple[Scene, jax.Array]:
-    scene = make_scene((_CELLS, _CELLS), _SPACING, _ANGLE, tool=Blade())
+    scene = usual_scene()
     level = jnp.zeros((_CELLS, _CELLS), jnp.float32)
     pushed = jax.jit(lambda s: jax.lax.map(lambda one: act(scene, level, one).height, s, batch_size=64))(
         pushes.random_strokes(batch)
     )
-    return make_scene((_CELLS, _CELLS), _SPACING, _ANGLE), jax.block_until_ready(pushed)
+    return usual_scene(tool=None), jax.block_until_ready(pushed)
 
 
 def _machine() -> str:

@@ -47,6 +47,7 @@ class SettlingCase:
     bad: bool = False
 
     def settle(self, height: np.ndarray) -> Settled:
+        """Settles a map [H, W] (m) in the scene of the case."""
         walls = None if self.solid is None else Walls(jnp.asarray(self.solid))
         edge = None if self.rim is None else Draining(self.rim)
         scene = make_scene(self.height.shape, self.spacing, self.angle, self.neighbours, walls=walls, edge=edge)
@@ -54,6 +55,7 @@ class SettlingCase:
 
     @property
     def tolerance(self) -> float:
+        """The slope in excess of repose that counts as still (a tangent)."""
         return min(1e-3, math.tan(np.min(self.angle)) / 10)
 
 

@@ -8,14 +8,12 @@ import numpy as np
 
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics
-from jaxsand.goals.surfaces import terrain_surface
-from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
+from jaxsand.goals.surfaces import rested, terrain_surface
+from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import rollout
 from jaxsand.planning.stroke_loss import SandLoss, sand_loss
-from jaxsand.relaxation.settling import settle
-from jaxsand.relaxation.stopping import UntilStill
-from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade
 
 
@@ -76,10 +74,8 @@ def turned_letters(names: str = string.ascii_uppercase, degrees: float = 30.0) -
 
 def letters_on_rough_sand(names: str = string.ascii_uppercase, relief: float = 0.01) -> list[StrokeGoal]:
     """Letters pushed into terrain of a height range `relief` (m)."""
-    scene = make_scene(SHAPE, SPACING)
-    rested = settle(scene, terrain_surface(scene.grid.shape, relief).astype(np.float32), stop=UntilStill(bound=200_000))
-    check(rested)
-    rough = np.asarray(rested.height)
+    scene = usual_scene(tool=None)
+    rough = rested(scene, terrain_surface(scene.grid.shape, relief))
     return [stroke_goal(f"{name} on rough sand", metrics.place(goals.letter_strokes(name)), rough) for name in names]
 
 

@@ -151,8 +151,23 @@ def bench_strokes(
     methods: tuple[str, ...] = (),
     out: Path | None = None,
 ) -> dict[str, list[Row]]:
-    """Methods (all, unless named) on one kind of `GOALS`, with up to so many calls; with a folder `out`, together with all
-    that is there of these goals."""
+    """Runs methods on goals that strokes make, and tabulates how near they come.
+
+    Args:
+      tell: is called with a line of progress.
+      goals: a kind of `GOALS`.
+      calls: how many calls of the simulator a method may make; smaller `BUDGETS` are tabulated too.
+      seeds: a run of each method on each goal for every seed.
+      methods: names of `METHODS`; none stands for all.
+      out: a folder that keeps the runs; those of these goals that are there already are tabulated too.
+
+    Returns:
+      `strokes`, a row for each method, as of `reached`; `strokes_by_goal`, a row for each run; and `strokes_curves`, the
+      runs themselves with the best so far after every call.
+
+    Raises:
+      ValueError: for the name of a method that does not exist.
+    """
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise ValueError(f"methods: got {', '.join(map(repr, unknown))}; give some of {', '.join(METHODS)}")

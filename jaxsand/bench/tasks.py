@@ -3,11 +3,12 @@
 import time
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from jaxsand.bench.rivals import earth
+from jaxsand.bench.tables import Row
+from jaxsand.goals.feasible import at_best
 from jaxsand.goals.goal import as_goal
 from jaxsand.goals.tasks import TASKS, Task, figures, make_task
 from jaxsand.planning.gradient import optimise_strokes
@@ -35,11 +36,13 @@ def bench_tasks(
     instances: int = 1,
     pushes: int = 500,
     seed: int = 0,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """A row for each task and method, with means over the instances (the worst is `worst_mm`); see `figures`.
 
     Every method may use as many strokes as the task allows, and simulate `pushes` pushes; a gradient counts as what it
     costs. `path_m` is the length of the strokes, and `moved` the volume (m^3) that they moved, summed over the strokes.
+    `at_best_mm` is the mean |height - goal| of the map that is nearest by the goal's cost, of all that repose and volume
+    allow, and `distance_at_best` (m) what no method's `distance` can be below (see `at_best`).
 
     Raises:
       ValueError: for a task or a method that does not exist.
@@ -66,15 +69,18 @@ def _mean(values: list[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def _one(task: Task, method: str, pushes: int, seed: int) -> dict[str, Any]:
+def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
     """The figures of a method on an instance of a task."""
     began = time.perf_counter()
     plan, effort = _planned(task, method, pushes, seed)
     seconds = time.perf_counter() - began
+    best = at_best(task.scene, task.start, task.goal)
     maps = finish(task.scene, plan[None], 0, task.start[None])[:, 0]
     moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in pairwise(maps))
     return {
         **figures(task, maps[-1]),
+        "at_best_mm": figures(task, best.height)["mean_mm"],
+        "distance_at_best": best.distance_bound,
         "strokes": float(len(plan)),
         "path_m": float(np.hypot(plan[:, 3] - plan[:, 0], plan[:, 4] - plan[:, 1]).sum()),
         "moved": moved * float(task.scene.grid.spacing) ** 2,

@@ -22,10 +22,12 @@ class Timed:
 
     @property
     def best(self) -> float:
+        """The shortest of the later calls (s)."""
         return min(self.later)
 
     @property
     def median(self) -> float:
+        """The median of the later calls (s)."""
         return float(np.median(self.later))
 
     @property

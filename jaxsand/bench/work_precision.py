@@ -51,6 +51,7 @@ class Collapse:
     edge: Draining | None = None
 
     def scene(self, n: int) -> Scene:
+        """The scene on n cells a side."""
         shape = self.heights(n).shape
         return make_scene((shape[0], shape[1]), 1.0, math.radians(self.degrees), self.neighbours, edge=self.edge)
 

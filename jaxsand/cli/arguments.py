@@ -15,6 +15,7 @@ class Parser(argparse.ArgumentParser):
     """Mistakes become one line `error: field: what; remedy` and exit code 2."""
 
     def error(self, message: str) -> NoReturn:
+        """Ends the program, and says what is wrong with the arguments."""
         field, what = "arguments", message
         if message.startswith("argument "):
             field, _, what = message.removeprefix("argument ").partition(": ")
@@ -23,6 +24,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def number(text: str) -> float:
+    """A number, from the command line."""
     try:
         return float(text)
     except ValueError:
@@ -38,16 +40,19 @@ def repose(text: str) -> float:
 
 
 def path_name(text: str) -> Path:
+    """The name of a file or folder, not empty."""
     if not text:
         raise argparse.ArgumentTypeError("got an empty name")
     return Path(text)
 
 
 def neighbours(text: str) -> int | str:
+    """A whole number, or a word, as `neighbours` of `make_scene`."""
     return int(text) if text.isdecimal() else text
 
 
 def count(text: str) -> int:
+    """A whole number of at least 1."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number of at least 1")
     return int(text)
@@ -61,6 +66,7 @@ def width(text: str) -> int:
 
 
 def seed(text: str) -> int:
+    """A whole number from 0 on that seeds a generator."""
     if not text.isdecimal() or int(text) > _LAST_SEED:
         raise argparse.ArgumentTypeError(f"got {text!r}, which is no whole number from 0 to {_LAST_SEED}")
     return int(text)
@@ -86,6 +92,7 @@ def ended(work: Callable[[], None]) -> int:
 
 
 def fail(message: str) -> int:
+    """Prints what went wrong as one line, and returns the exit code 2."""
     if sys.stderr.isatty():
         print("\r\033[K", end="", file=sys.stderr)
     print("error: " + " ".join(message.split()), file=sys.stderr)

@@ -14,6 +14,7 @@ _STROKE_GOALS = ("letters", "turned", "rough", "eight")
 
 
 def run_benchmark(options: argparse.Namespace) -> None:
+    """Runs `jaxsand bench`."""
     tell = progress()
     out = folder(options.out) if options.out else None
     if options.what == "env":

@@ -4,10 +4,15 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxsand.scene.progress import Tell
 
 
 def existing(path: Path, accepted: str = "") -> Path:
@@ -24,7 +29,22 @@ def existing(path: Path, accepted: str = "") -> Path:
     return path
 
 
+def plausible(heights: "np.ndarray", most: float, file: str, middle: float = 0.0) -> None:
+    """Raises ValueError where a height lies further from the middle than `most` (m), as a value for no data does."""
+    import numpy as np
+
+    off = np.abs(np.where(np.isfinite(heights), heights, middle).astype(float) - middle)
+    if bad := int((off > most).sum()):
+        value, where = f"{float(heights.ravel()[np.argmax(off)]):.6g}", f"{middle:.4g} m" if middle else "level sand"
+        raise ValueError(
+            f"{file}: got {bad} cells more than {most:.4g} m above or below {where}, such as {value}, "
+            f"too much for a map of this size; where that stands for no data, give --no-data {value}, "
+            "and heights are in metres"
+        )
+
+
 def read_text(path: Path) -> str:
+    """The text of a file."""
     try:
         return existing(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -56,7 +76,7 @@ def written(path: Path) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
-def progress() -> Callable[[str], None]:
+def progress() -> "Tell":
     """Tells what goes on, on a terminal's one line; silent when piped."""
     if not sys.stderr.isatty():
         return lambda _: None

@@ -49,18 +49,19 @@ def _parser() -> argparse.ArgumentParser:
 def _shape(commands: Any) -> None:
     p = commands.add_parser("shape", help="find the strokes that trench a goal, push them, show what came out")
     p.add_argument("goal", help=_GOAL)
-    p.add_argument("--method", choices=["plan", "optimise", "policy", "search", "strokes"], default="plan", help=_METHODS)
+    p.add_argument("--method", choices=["plan", "optimise", "policy", "search", "strokes"], help=_METHODS)
     p.add_argument(
         "--strokes",
         type=count,
         metavar="N",
-        help="strokes to use (optimise: as many as pay; search, policy: a glyph's own number, else 6)",
+        help="strokes to use at most (a glyph's own number; else optimise: as many as pay, policy: 6, search: 24)",
     )
     p.add_argument(
         "--pushes",
         type=count,
         metavar="N",
-        help="most pushes that are tried (optimise: 4000; search: 1000 a stroke; policy: its own, and 4000 by --refine)",
+        help="most pushes that are tried (optimise: 4000; search: 2000, of a glyph 1000 a stroke; policy: its own, and 4000 "
+        "by --refine)",
     )
     p.add_argument(
         "--lookahead",
@@ -190,6 +191,7 @@ _NO_DATA = (
     "else they are refused"
 )
 _METHODS = (
-    "plan: a shortest path; optimise: strokes by gradients through the sand; policy: what a network learned; "
-    "search: strokes tried on real sand; strokes: a glyph's own"
+    "plan: a shortest path (the default for letters and .txt maps); search: strokes tried on real sand (the default for "
+    "all that has heights); optimise: strokes by gradients through the sand; policy: what a network learned; strokes: a "
+    "glyph's own"
 )

@@ -9,6 +9,7 @@ from jaxsand.cli.printing import lines, plain_name, read_cell, show
 
 
 def run_plan(options: argparse.Namespace) -> None:
+    """Runs `jaxsand plan`."""
     tell = progress()
     from jaxsand.goals import letters
     from jaxsand.planning.binary import plan

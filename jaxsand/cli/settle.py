@@ -5,13 +5,15 @@ import math
 import sys
 import time
 
-from jaxsand.cli.files import existing, folder, progress, written
+from jaxsand.cli.files import existing, folder, plausible, progress, written
 from jaxsand.cli.printing import lines, show
 
 SCHEMES = ("relaxation", "pairwise", "super-time-stepping", "multilevel")
+_TALLEST = 10  # times a map's side: what is higher or lower than that is no sand
 
 
 def run_settle(options: argparse.Namespace) -> None:
+    """Runs `jaxsand settle`."""
     tell = progress()
     if options.out_file.suffix != ".npy":
         raise ValueError(f"out-file: got {options.out_file}; give a name that ends in .npy")
@@ -40,6 +42,9 @@ def run_settle(options: argparse.Namespace) -> None:
         )
     walls = Walls(jax.numpy.asarray(solid)) if solid.any() else None
     scene = make_scene(heights.shape, options.spacing, math.radians(options.repose_deg), options.neighbours, walls=walls)
+    if not solid.all():
+        sand = heights[~solid]
+        plausible(sand, _TALLEST * options.spacing * max(heights.shape), str(options.input), float(np.median(sand)))
     scheme = getattr(schemes, options.scheme.title().replace("-", ""))()
     stop = UntilStill(options.tol, bound=options.bound)
     folder(options.out_file.parent)

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxsand.cli.files import existing, folder, progress, read_text, write_json, written
+from jaxsand.cli.files import existing, folder, plausible, progress, read_text, write_json, written
 from jaxsand.cli.printing import plain_name, read_cell, show
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 
 def run_shape(options: argparse.Namespace) -> None:
+    """Runs `jaxsand shape`."""
+    options.method = options.method or _suited(options.goal)
     _check_options(options)
     tell = progress()
     started = time.perf_counter()
@@ -32,11 +34,13 @@ def run_shape(options: argparse.Namespace) -> None:
     began = time.perf_counter()
     target = _target(options)
     surface = _surface(options, target)
-    strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6)
+    level = target.kind == "glyph" or options.method != "search"
+    strokes = options.strokes or (len(target.paths) if target.kind == "glyph" else 6 if level else _STROKES)
     polish = _polish(options, strokes)
     out = folder(options.out or Path(f"shape-{plain_name(options.goal)}"))
     if options.method == "search":
-        target = searched(target, surface, strokes, options.pushes or 1000 * strokes, options.seed or 0, tell)
+        pushes = options.pushes or (1000 * strokes if level else _PUSHES)
+        target = searched(target, surface, strokes, pushes, options.seed or 0, tell)
     if options.method == "optimise":
         target = optimised(target, surface, options.strokes, options.pushes or 4000, options.seed or 0, tell)
     if options.method == "policy":
@@ -60,6 +64,8 @@ def run_shape(options: argparse.Namespace) -> None:
     tell("")
     if target.found and target.found.reason:
         print(f"warning: strokes: {target.found.reason}{_dug_alone(target)}", file=sys.stderr)
+    if target.missed:
+        print(f"warning: goal: {_left_out(target, options)}", file=sys.stderr)
     show(options, report, _summary)
 
 
@@ -70,10 +76,13 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
         "goal_kind": target.kind,
         "method": target.method,
         "strokes": [[round(v, 6) for v in stroke] for stroke in result.strokes],
+        "paths": [[[round(float(v), 6) for v in point] for point in path] for path in target.paths],
         "lifted": result.lifted,
         "steps": result.steps,
-        **({"optimal": target.optimal, "lower_bound": target.lower_bound} if target.method == "plan" else {}),
-        **({"search": _found(target.found) | {"reason": target.found.reason}} if target.found else {}),
+        **(
+            {name: getattr(target, name) for name in ("optimal", "lower_bound", "missed")} if target.method == "plan" else {}
+        ),
+        **({"search": _found(target.found) | _at_best(result) | {"reason": target.found.reason}} if target.found else {}),
         **result.figures,
         "seconds": total,
         "seconds_plan": planned + seconds["prepare"],
@@ -88,7 +97,10 @@ def _report(result: "ShapeResult", total: float, planned: float, drawn: float, f
 
 _ROWS = "heights in metres, first row at y = 0; with --first-row top, on top as in pictures and maps"
 _OTHER_FILES = (".asc", ".bmp", ".csv", ".dem", ".gif", ".hgt", ".jpeg", ".jpg", ".npz", ".svg", ".tif", ".tiff")
+_STROKES, _PUSHES = 24, 2000  # of a search for strokes that rise and sink, unless told otherwise
 _REFINED = 4000  # pushes by --refine, unless told otherwise
+_RESOLUTION = 6  # grid cells to a block's side, unless told otherwise
+_SPACING = 0.01  # m, unless told otherwise
 _DARK = 0.5  # of black: what a picture's free cells are darker than
 _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
 
@@ -100,6 +112,11 @@ _BY = {
     "refine": ("policy",),
     "free": ("search", "optimise", "policy"),
 }
+
+
+def _suited(goal: str) -> str:
+    """The method where none is told: the shortest stroke over a map, a search for a goal that has heights."""
+    return "search" if goal == "terrain" or Path(goal).suffix.lower() in (".png", ".npy", ".json") else "plan"
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -156,10 +173,19 @@ def _found(found: "SandPlan | Optimised | Planned") -> dict[str, Any]:
     }
 
 
+def _at_best(result: "ShapeResult") -> dict[str, Any]:
+    """What l2 distance repose and volume leave at least, whatever the strokes (m)."""
+    from jaxsand.goals.feasible import at_best
+
+    return {"at_best": at_best(result.target.scene, result.before, result.target.goal).distance_bound}
+
+
 def _summary(report: dict[str, Any]) -> str:
     how = f"{report['steps']} strokes"
     if report["method"] == "plan":
         proof = "proven shortest" if report["optimal"] else f"at least {report['lower_bound']} are needed"
+        if report["missed"]:
+            proof = f"over a part of the goal: {report['missed']} of its dug cells are left out"
         how = f"{report['steps']} steps ({proof})"
     if "search" in report:
         how += f" found in {report['search']['rollouts']:.0f} pushes"
@@ -168,12 +194,21 @@ def _summary(report: dict[str, Any]) -> str:
             f"{report['goal']} ({report['goal_kind']}): {how}",
             f"IoU {report['iou']:.3f}, l2 reduction {report['l2_reduction']:.3f} "
             f"(with berms {report['l2_reduction_with_berms']:.3f})",
+            *_distances(report.get("search")),
             f"volume error {report['volume_error']:.1e}, steepest slope {report['max_slope_deg']:.2f} deg",
             f"compile {report['seconds_compile']:.2f} s, run {report['seconds_run']:.2f} s, "
             f"plan {report['seconds_plan']:.2f} s, draw {report['seconds_draw']:.2f} s",
             *report["files"],
         )
     )
+
+
+def _distances(search: dict[str, Any] | None) -> list[str]:
+    """How near the strokes of a search come, and how near sand can come at best."""
+    if search is None:
+        return []
+    before, after, best = (1e3 * search[name] for name in ("before", "after", "at_best"))
+    return [f"l2 distance {before:.2f} mm before, {after:.2f} mm after; at best, by repose and volume alone, {best:.2f} mm"]
 
 
 def _target(options: argparse.Namespace) -> "Target":
@@ -218,21 +253,26 @@ def _target(options: argparse.Namespace) -> "Target":
 def _surface_target(options: argparse.Namespace) -> "Target":
     """The goal that a picture, heights, a drawing or the terrain is; with strokes only where the method is to plan them."""
     from jaxsand.goals import letters, surfaces
+    from jaxsand.goals.goal import Goal
     from jaxsand.planning import pipeline
 
     name, path, planned = options.goal, Path(options.goal), options.method == "plan"
     if options.start:
         raise ValueError(f"start: {name} is no map of # and .; leave --start out")
     if path.suffix.lower() == ".png":
-        picture = letters.read_image(existing(path))
-        if not planned:
+        if options.method in ("optimise", "policy"):
             raise _drawn(options)
-        return pipeline.image_target(picture, path.stem, _layout(options), _cells(options))
+        layout = _layout(options)
+        heights = pipeline.image_goal(letters.read_image(existing(path)), layout, _cells(options))
+        if planned:
+            return pipeline.height_target(heights, "image", path.stem, layout)
+        return pipeline.height_goal(Goal(heights, above=(heights < 0) * 1.0), "image", path.stem, layout)
     if path.suffix.lower() == ".json":
         return _drawing_target(path, options)
     if name == "terrain":
         layout = _layout(options, _DEEP)
         heights = surfaces.terrain_surface((_cells(options), _cells(options)), 4 * layout.depth)
+        heights -= 0 if planned else heights.mean()  # what is dug is heaped
     else:
         heights = _goal_heights(path, options)
         layout = _layout(options, _DEEP if planned else _deep_enough(heights, options.method))
@@ -334,11 +374,29 @@ def _read_heights(path: Path, options: argparse.Namespace) -> "np.ndarray":
     from jaxsand.goals.letters import read_heights
 
     heights = read_heights(existing(path), options.no_data)
+    spacing = _SPACING if options.spacing is None else options.spacing
+    if spacing > 0:
+        plausible(heights, spacing * max(heights.shape), str(path))
     return heights[::-1] if options.first_row == "top" else heights
 
 
 def _drawn(options: argparse.Namespace) -> ValueError:
-    return ValueError(f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method plan")
+    other = "plan or search" if Path(options.goal).suffix.lower() == ".png" else "plan"
+    return ValueError(
+        f"method: {options.method!r} compares berms too, which {options.goal} has none of; use --method {other}"
+    )
+
+
+def _left_out(target: "Target", options: argparse.Namespace) -> str:
+    """What a plan over blocks leaves out of a goal, and what to do about it."""
+    from jaxsand.goals.metrics import dug
+
+    finer = " smaller --resolution" if (options.resolution or _RESOLUTION) > 1 else " finer goal"
+    other = "search" if target.kind == "image" else "search or optimise"
+    return (
+        f"{target.missed} of {int(dug(target.goal, target.depth).sum())} dug cells are left out, since the blocks of cells "
+        f"that they lie in are not dug deep enough in the mean; give a{finer}, or use --method {other}"
+    )
 
 
 def _dug_alone(target: "Target") -> str:
@@ -364,8 +422,8 @@ def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
     from jaxsand.planning.pipeline import Layout
 
     depth = depth_mm if options.depth_mm is None else options.depth_mm
-    spacing = 0.01 if options.spacing is None else options.spacing
-    resolution = options.resolution or 6
+    spacing = _SPACING if options.spacing is None else options.spacing
+    resolution = options.resolution or _RESOLUTION
     scrapes = options.method in ("search", "optimise") and depth == 0
     for field, value in (("spacing", spacing), *(() if scrapes else (("depth-mm", depth),))):
         if not (math.isfinite(value) and value > 0):

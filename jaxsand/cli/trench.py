@@ -13,6 +13,7 @@ _FILES = ("profiles.csv", "trench.png", "trench-errors.png", "trench.json")
 
 
 def run_trench(options: argparse.Namespace) -> None:
+    """Runs `jaxsand trench`."""
     tell = progress()
     if not 0.25 <= options.spacing_mm <= 20:
         raise ValueError(f"spacing-mm: got {options.spacing_mm:g}; give millimetres from 0.25 to 20")

@@ -4,18 +4,26 @@ They follow the protocol of gymnax 1.x: an environment is a static object, the s
 parameters, and the leaves of both may be vmapped; see `episode.Environment`.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import Field, fields, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import fields, replace
 from typing import Any, Literal, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
 
-from jaxsand.envs.checks import check_heights, check_kinds, check_limit, check_ready_goals, check_scene, check_zones
+from jaxsand.envs.checks import (
+    check_heights,
+    check_kinds,
+    check_limit,
+    check_measure,
+    check_ready_goals,
+    check_scene,
+    check_zones,
+)
 from jaxsand.envs.digs import RandomDigs, dug
 from jaxsand.envs.excavate import Excavate, ExcavateParams, ExcavateState
 from jaxsand.envs.heights import Heights, OwnDepth
-from jaxsand.envs.library import Goals, Level, RandomStrokes, Rough, library
+from jaxsand.envs.library import Goals, Level, RandomStrokes, Rough, Starts, library
 from jaxsand.envs.maps import MapPool, Walks, map_pool, pool_of
 from jaxsand.envs.multi import (
     LevelGoals,
@@ -126,9 +134,11 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
       **options: for "single-stroke": `on`, `OnMap()` (a binary map, the default) or `OnSand()` (the simulator); `goals`, a
         `Walks()` or a `MapPool` (see `map_pool`, `pool_of`); `step_cost`; `limit`, steps after which an episode is
         truncated; and, with `OnSand()`, the `scene`. For "multi-stroke": the fields of `MultiStroke`; `goals`, a
-        `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, or maps [G, H, W] (m), such as
-        `jaxsand.task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no berms);
-        `starts`, a `Level()` or `Rough(relief)`; `seed`, for both; `scene`, by default 32 x 32 cells of 0.01 m with the
+        `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, a map [H, W] or maps [G, H, W] (m), such as
+        `jaxsand.task.resample` makes of a picture or a terrain (with `measure=OnlyDug()` where they hold no berms), with NaN
+        in free cells, or a `jaxsand.Goal` of such, whose weights are numbers, one map [H, W] or maps [G, H, W], and by whose
+        distance rewards are then measured; `starts`, a `Level()`, `Rough(relief)`, or sand at rest, a map [H, W] or one for
+        each goal [G, H, W] (m); `seed`, for both; `scene`, by default 32 x 32 cells of 0.01 m with the
         default blade, and a window of 12 x 12 cells that is computed around the blade while it is down; `limit`, strokes
         after which an episode is truncated; `zones`, where the blade may not be: `ClippedBy(cells)` or `RefusedBy(cells)`.
         For "excavate": the fields of `Excavate`, and `goals` (also a `RandomDigs()`, the default), `starts`, `seed`, `scene`
@@ -168,7 +178,8 @@ def _single(
 ) -> tuple[OnMap, MapParams] | tuple[OnSand, SandParams]:
     """The single stroke with the given options."""
     env = OnMap() if on is None else on
-    _known("single-stroke", params, fields(MapParams))
+    ours = [f.name for f in fields(MapParams)]
+    _known("single-stroke", params, ("on", "scene", *ours), ours)
     check_kinds({"on": env, **params})
     check_limit(params)
     if isinstance(env, OnMap):
@@ -188,7 +199,7 @@ def _single(
 
 def _multi(
     goals: Goals | LevelGoals | RoughGoals | None = None,
-    starts: Level | Rough | None = None,
+    starts: Starts | None = None,
     scene: Scene | None = None,
     seed: int = 0,
     **options: Any,
@@ -209,12 +220,13 @@ def _multi(
     else:
         begin = Level() if starts is None else starts
         pool = library(env, scene, RandomStrokes() if goals is None else goals, begin, seed, zones)
+    check_measure(env, pool)
     return env, StrokeParams(scene, pool, **params)
 
 
 def _excavate(
     goals: RandomDigs | Goals | LevelGoals | RoughGoals | None = None,
-    starts: Level | Rough | None = None,
+    starts: Starts | None = None,
     scene: Scene | None = None,
     seed: int = 0,
     **options: Any,
@@ -239,6 +251,7 @@ def _excavate(
         blade = Blade(bucket.width, jnp.maximum(Blade().thickness, dx), bucket.depth)
         pusher = MultiStroke(env.push, batching=env.batching, settle=env.settle)
         pool = library(pusher, with_near(replace(scene, tool=blade)), goals, begin, seed, zones)
+    check_measure(env, pool)
     return env, ExcavateParams(scene, pool, **params)
 
 
@@ -247,20 +260,19 @@ Env = TypeVar("Env", MultiStroke, Excavate)
 
 def _of_kind(name: str, kind: type[Env], options: Mapping[str, Any], seed: int) -> tuple[Env, dict[str, Any]]:
     """An environment with those of the options that are its fields, and the others, which are its parameters'."""
-    own = {f.name for f in fields(kind)}
+    own: list[str] = sorted(f.name for f in fields(kind))
     chosen = {key: value for key, value in options.items() if key in own}
     params = {key: value for key, value in options.items() if key not in own}
     check_kinds(chosen)
-    _known(name, params, (f for f in fields(StrokeParams) if f.name in ("limit", "zones")))
+    _known(name, params, ("goals", "starts", "seed", "scene", "limit", "zones", *own), ("limit", "zones"))
     check_kinds(params)
     check_limit(params)
     check_whole("seed", seed, 0)
     return kind(**chosen), params
 
 
-def _known(name: str, options: Mapping[str, object], some: Iterable[Field[Any]]) -> None:
-    """Raises ValueError for an option that is none of the fields in `some`."""
-    names = [f.name for f in some]
+def _known(name: str, options: Mapping[str, object], allowed: Iterable[str], here: Collection[str]) -> None:
+    """Raises ValueError for an option that is not in `here`, naming all that the environment's kind allows."""
     for option in options:
-        if option not in names:
-            raise ValueError(f"{option}: no option of {name}; give some of {', '.join(names)}, or see help(jaxsand.make)")
+        if option not in here:
+            raise ValueError(f"{option}: no option of {name}; give some of {', '.join(allowed)}, or see help(jaxsand.make)")

@@ -10,11 +10,13 @@ import numpy as np
 from jaxsand.envs.excavate import Excavate
 from jaxsand.envs.heights import Heights, OwnDepth
 from jaxsand.envs.maps import MapGoals
-from jaxsand.envs.multi import LevelGoals, Measure, MultiStroke, NoStop, RoughGoals, Stop
+from jaxsand.envs.multi import LevelGoals, Measure, MultiStroke, NoStop, RoughGoals, Stop, WithBerms
 from jaxsand.envs.onmap import OnMap
 from jaxsand.envs.onsand import OnSand
 from jaxsand.envs.pushing import Batching, Push
+from jaxsand.envs.weights import heights
 from jaxsand.envs.zones import NoZones, Zones
+from jaxsand.goals.goal import Goal
 from jaxsand.goals.metrics import finite
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
@@ -62,30 +64,55 @@ def check_scene(scene: object, tool_of: Callable[[Scene], Blade | Bucket] = blad
 
 
 def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: object) -> None:
-    """Raises ValueError for goals that are not of the scene's shape or not finite, or with `starts` beside goals that have
-    their own.
+    """Raises ValueError for goals that are not of the scene's shape or not finite, for weights that are neither numbers nor
+    maps like theirs, or with `starts` beside goals that have their own.
     """
-    if goals.goals.shape[-2:] != scene.grid.shape:
-        raise ValueError(f"goals: got maps of {list(goals.goals.shape[-2:])}, the scene has {list(scene.grid.shape)} cells")
-    for field in fields(goals):
-        maps = getattr(goals, field.name)
-        if not isinstance(maps, jax.core.Tracer):
-            finite(maps, field.name)
+    maps = heights(goals.goals)
+    if maps.shape[-2:] != scene.grid.shape:
+        raise ValueError(f"goals: got maps of {list(maps.shape[-2:])}, the scene has {list(scene.grid.shape)} cells")
+    for name, some in {**{f.name: getattr(goals, f.name) for f in fields(goals)}, "goals": maps}.items():
+        if not isinstance(some, jax.core.Tracer):
+            finite(some, name)
+    if isinstance(goals.goals, Goal):
+        _check_ready_weights(goals.goals, maps.shape)
     if starts is not None:
         raise ValueError(f"starts: got {starts!r} beside goals that are ready; leave it out, or give strokes as goals")
 
 
+def _check_ready_weights(goal: Goal, shape: tuple[int, ...]) -> None:
+    """Raises ValueError for weights that are neither numbers nor maps of a shape, or below 0; traced ones pass."""
+    sides = {side: np.shape(getattr(goal, side)) for side in ("above", "below")}
+    if set(sides.values()) not in ({()}, {shape}):
+        got = " and ".join(f"{side} of shape {list(some)}" for side, some in sides.items())
+        raise ValueError(f"goals: got {got}; give two numbers, or two arrays of shape {list(shape)}")
+    for side in sides:
+        weights = concrete(getattr(goal, side))
+        if weights is not None and not np.all(np.isfinite(weights) & (weights >= 0)):
+            raise ValueError(f"goals.{side}: got a weight that is below 0 or not finite; give weights of 0 or more")
+
+
+def check_measure(env: MultiStroke | Excavate, goals: LevelGoals | RoughGoals) -> None:
+    """Raises ValueError for a measure beside goals that measure by themselves."""
+    if isinstance(goals.goals, Goal) and not isinstance(env.measure, WithBerms):
+        raise ValueError(
+            f"measure: got {env.measure} beside goals with weights or free cells, which say themselves what matters; "
+            "leave it out, and give the weights as goals=Goal(maps, above, below, power)"
+        )
+
+
 def check_heights(env: MultiStroke | Excavate, tool: Blade | Bucket) -> None:
     """Raises ValueError unless the push can change the tool's height, and its depth is one to measure heights in."""
+    depth = concrete(tool.depth)
+    if depth is not None and not np.all(depth > 0):
+        raise ValueError(
+            f"scene.tool.depth: got {depth} m; give a depth above 0, the unit of observations, rewards and Heights()"
+        )
     if isinstance(env.heights, OwnDepth):
         if isinstance(env, MultiStroke):
             return
         raise ValueError(f"heights: got {env.heights}; a bucket scoops between heights: give Heights(lowest, highest)")
     if not isinstance(env.push, SteppedPush):
         raise ValueError(f"push: got {env.push!r}, which keeps its tool at one depth; give SteppedPush() with Heights()")
-    depth = concrete(tool.depth)
-    if depth is not None and not np.all(depth > 0):
-        raise ValueError(f"scene.tool.depth: got {depth} m; give a depth above 0, of which Heights() are multiples")
 
 
 def check_zones(scene: Scene, zones: Zones) -> None:

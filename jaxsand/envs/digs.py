@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsand.envs.excavate import Bed, Excavate
 from jaxsand.envs.heights import Heights
-from jaxsand.envs.library import Level, RandomStrokes, Rough, glyph_square, played, pool_from, surfaces
+from jaxsand.envs.library import RandomStrokes, Starts, glyph_square, played, pool_from, surfaces
 from jaxsand.envs.multi import LevelGoals, RoughGoals
 from jaxsand.envs.zones import Zones
 from jaxsand.goals import metrics
@@ -72,9 +72,7 @@ class RandomDigs:
         return places[first, np.arange(len(way))]
 
 
-def dug(
-    env: Excavate, scene: Scene, goals: RandomDigs, starts: Level | Rough, seed: int, zones: Zones
-) -> LevelGoals | RoughGoals:
+def dug(env: Excavate, scene: Scene, goals: RandomDigs, starts: Starts, seed: int, zones: Zones) -> LevelGoals | RoughGoals:
     """Makes the pool of goals that random digs leave, dug as the environment digs, around its zones."""
     rng = np.random.default_rng(seed)
     plans = [placed(scene, plan) for plan in goals.plans(rng, env.heights)]

@@ -12,6 +12,7 @@ from jaxsand.envs.heights import Heights, off_map, on_map
 from jaxsand.envs.multi import LevelGoals, Measure, NoStop, RoughGoals, Stop, WithBerms
 from jaxsand.envs.pushing import Batching, ByLength, Pushing
 from jaxsand.envs.spaces import Box, Dict
+from jaxsand.envs.weights import Wanted, shown, shown_spaces
 from jaxsand.envs.zones import NoZones, Told, Zones, kept
 from jaxsand.interaction.bucket import bucket_of, dump, scoop
 from jaxsand.interaction.load import Load, as_load
@@ -30,7 +31,7 @@ class ExcavateState:
     """The state of an episode of excavation.
 
     Attributes:
-      goal: [H, W] (m).
+      goal: [H, W] (m), or a `jaxsand.Goal` of it and its weights.
       height: the sand as it lies, [H, W] (m).
       load: what the bucket holds; see `Load`.
       time: actions so far.
@@ -45,7 +46,7 @@ class ExcavateState:
       0.0
     """
 
-    goal: jax.Array
+    goal: Wanted
     height: jax.Array
     load: Load
     time: jax.Array
@@ -86,14 +87,15 @@ class Excavate:
     the share of what the bucket holds after the scoop from 0 (nothing) to 1 (all of it). What is not poured stays in the
     bucket for the next action. A share above 1 pours all, and the outcome says NOT_POURED; one below 0 pours nothing, and
     the outcome says NOT_FINITE. Observations are the maps "goal" and "current" [H, W] in units of the bucket's depth, and
-    "load", what the bucket holds as a share of its capacity (float32).
+    "load", what the bucket holds as a share of its capacity (float32). Where goals have weights that are maps, these follow
+    as "above" and "below"; free cells have weights of 0 and a goal of 0.
 
-    With L = sqrt(sum (goal - h)^2), of the maps as `measure` sees them and in units of the bucket's depth, the reward is
-    L_t - L_{t+1}; what the bucket holds does not count. Bed and bucket together keep their volume. An episode is truncated
-    after `limit` actions, and terminated when a `Stop` asks for it, in place of a dig. `info` holds the simulator's
-    "outcome", and with zones "clipped", "went" and "poured": a scoop that may not be made leaves map and load as they were,
-    and a bucket is not emptied where its sand would fall on a zone. A dig that leaves a map that is not finite leaves map
-    and load as they were, too.
+    With L = sqrt(sum (goal - h)^2), of the maps as `measure` sees them, or the distance of a `jaxsand.Goal` by its weights,
+    and in units of the bucket's depth, the reward is L_t - L_{t+1}; what the bucket holds does not count. Bed and bucket
+    together keep their volume. An episode is truncated after `limit` actions, and terminated when a `Stop` asks for it, in
+    place of a dig. `info` holds the simulator's "outcome", and with zones "clipped", "went" and "poured": a scoop that may
+    not be made leaves map and load as they were, and a bucket is not emptied where its sand would fall on a zone. A dig that
+    leaves a map that is not finite leaves map and load as they were, too.
 
     The reward is differentiable once, in forward and reverse mode, in the action, the state's map and load, and the scene's
     floats, but where the bucket just becomes full or empty.
@@ -146,18 +148,15 @@ class Excavate:
           Observation, state, reward, terminated, truncated, info.
         """
         del key
-        action = jnp.asarray(action, state.height.dtype)
-        if action.shape != (self.size,):
-            raise ValueError(f"action: got shape {list(action.shape)}; give {self.size} numbers")
+        action = episode.checked(self, action, state.height.dtype)
         before = (state.height, state.load)
         after, outcome, told = self.digs(params.scene, before, self.dig(action, params), params.zones)
         (height, load), terminated = self.stop.over(action, before, after)
         new = ExcavateState(state.goal, height, load, state.time + 1)
-        reward = self.distance(state, params) - self.distance(new, params)
-        truncated = (new.time >= params.limit) & ~terminated
-        return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome} | told
+        return episode.concluded(self, state, new, terminated, params, {"outcome": outcome} | told)
 
     step = episode.step  # `step_env`, and the next episode begins where that ended one
+    action_space = episode.action_space
 
     def digs(self, scene: Scene, before: Bed, dig: jax.Array, zones: Zones) -> tuple[Bed, jax.Array, Told]:
         """The map and the load that a dig [9] leaves, its outcome, and what zones have to tell."""
@@ -191,22 +190,15 @@ class Excavate:
         return jnp.concatenate([way, off_map(dig[None, 6:8], grid)[0], 2 * dig[8:9] - 1, more])
 
     def observe(self, state: ExcavateState, params: ExcavateParams) -> dict[str, jax.Array]:
-        """The observation of a state: its two maps in units of the bucket's depth, and the load as a share (float32)."""
+        """The observation of a state: its maps in units of the bucket's depth, weights that are maps, and the load."""
         bucket, dx = bucket_of(params.scene), jnp.asarray(params.scene.grid.spacing, state.height.dtype)
         full = (state.load.high + state.load.low) * dx**2 / bucket.capacity
-        maps = {"goal": state.goal / bucket.depth, "current": state.height / bucket.depth}
-        seen = maps | {"load": jnp.clip(full, 0, 1)}  # of a full bucket it may be a rounding error more
-        return {name: x.astype(jnp.float32) for name, x in seen.items()}
-
-    def action_space(self, params: ExcavateParams) -> Box:
-        """The space of actions."""
-        del params
-        return Box(-1, 1, (self.size,))
+        load = jnp.clip(full, 0, 1)  # of a full bucket it may be a rounding error more
+        return shown(state.goal, state.height, bucket.depth) | {"load": load.astype(jnp.float32)}
 
     def observation_space(self, params: ExcavateParams) -> Dict:
         """The space of observations."""
-        maps = {name: Box(-jnp.inf, jnp.inf, params.scene.grid.shape) for name in ("goal", "current")}
-        return Dict(maps | {"load": Box(0, 1, ())})
+        return Dict(shown_spaces(params.goals.goals, params.scene.grid.shape) | {"load": Box(0, 1, ())})
 
 
 @cache

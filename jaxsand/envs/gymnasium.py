@@ -13,6 +13,7 @@ does not begin anew by itself.
 Needs the extra `gym`: pip install 'jaxsand[gym]'.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -29,6 +30,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from jaxsand.envs import Box, Excavate, Heights, MultiStroke, OnMap, OnSand, make
+from jaxsand.envs.weights import shown_weights
+from jaxsand.goals.goal import Goal
 
 SINGLE, MULTI = "jaxsand/SingleStroke-v0", "jaxsand/MultiStroke-v0"
 HEIGHTS, EXCAVATE = "jaxsand/MultiStrokeHeights-v0", "jaxsand/Excavate-v0"
@@ -102,7 +105,7 @@ class _Sand(gymnasium.Env):
         _no_other(options)
         obs, self.state, about = _alone(self.core)[0](_key(self.np_random), self.params)
         self.shown = _arrays(obs)
-        return _view(self.shown), _arrays(about)
+        return _view(self.core, self.shown), _arrays(about)
 
     def step(self, action: ArrayLike) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         """Takes one action; returns observation, reward, terminated, truncated and info."""
@@ -112,7 +115,7 @@ class _Sand(gymnasium.Env):
         out = _alone(self.core)[1](jax.random.key(0), self.state, np.asarray(action), self.params)
         obs, self.state, reward, terminated, truncated, info = out
         self.shown = _arrays(obs)
-        return _view(self.shown), float(reward), bool(terminated), bool(truncated), _arrays(info)
+        return _view(self.core, self.shown), float(reward), bool(terminated), bool(truncated), _arrays(info)
 
     def render(self) -> np.ndarray | None:
         """A picture of goal and sand side by side, [height, width, 3] (uint8); None unless render_mode is "rgb_array"."""
@@ -148,13 +151,14 @@ class MultiStrokeEnv(_Sand):
     """Many strokes as a Gymnasium goal environment, "jaxsand/MultiStroke-v0", or "jaxsand/MultiStrokeHeights-v0".
 
     Observations are maps [H, W] in units of the blade's depth: "observation" and "achieved_goal", both the sand as it lies,
-    and "desired_goal". An action holds x0, y0, x1, y1 from -1 to 1, from the first to the last cell centre of the map;
-    numbers beyond that push from off the map. With `heights=Heights()`, the default of the second name, it holds x0, y0, z0,
-    x1, y1, z1.
+    and "desired_goal". Where goals have weights that are maps, "achieved_goal" and "desired_goal" are three maps [3, H, W],
+    heights and the goal's weights above and below: what was achieved, taken for a goal, weighs cells as that goal did. An
+    action holds x0, y0, x1, y1 from -1 to 1, from the first to the last cell centre of the map; numbers beyond that push
+    from off the map. With `heights=Heights()`, the default of the second name, it holds x0, y0, z0, x1, y1, z1.
 
-    The reward is L_t - L_{t+1}, with L the distance by `measure`, by default sqrt(sum (goal - h)^2). It depends on the map
-    before the push, which is in info["previous"]. So an algorithm that relabels goals must keep the infos (of
-    Stable-Baselines3: replay_buffer_kwargs={"copy_info_dict": True}).
+    The reward is L_t - L_{t+1}, with L the distance by `measure`, by default sqrt(sum (goal - h)^2), or that of a
+    `jaxsand.Goal` by its weights. It depends on the map before the push, which is in info["previous"]. So an algorithm that
+    relabels goals must keep the infos (of Stable-Baselines3: replay_buffer_kwargs={"copy_info_dict": True}).
 
     Args:
       render_mode: "rgb_array" or None.
@@ -184,7 +188,8 @@ class MultiStrokeEnv(_Sand):
         """The reward of a push for any goal, exactly as `step` computes it for the goal that was given.
 
         Args:
-          achieved_goal: the map after the push, [H, W], or [B, H, W] for many; maps may be flattened.
+          achieved_goal: the map after the push, [H, W], or [B, H, W] for many; with weights that are maps [3, H, W], or
+            [B, 3, H, W] for many. Arrays may be flattened.
           desired_goal: the goal, of the same shape.
           info: the info of the push, or B infos; info["previous"] is the map before the push.
 
@@ -201,37 +206,37 @@ class MultiStrokeEnv(_Sand):
                 "info: got one without 'previous', the map before the push; keep the infos of `step` "
                 "(Stable-Baselines3: replay_buffer_kwargs={'copy_info_dict': True})"
             )
-        before, goal, after = (
-            self._maps(name, maps, len(infos))
-            for name, maps in (
-                ("info", np.array([one["previous"] for one in infos])),
-                ("desired_goal", desired_goal),
-                ("achieved_goal", achieved_goal),
+        sand = self.params.scene.grid.shape
+        goals = (3, *sand) if shown_weights(self.params.goals.goals) else sand
+        before, wanted, after = (
+            _reshaped(name, maps, len(infos), shape)
+            for name, maps, shape in (
+                ("info", np.array([one["previous"] for one in infos]), sand),
+                ("desired_goal", desired_goal, goals),
+                ("achieved_goal", achieved_goal, goals),
             )
         )
-        reward = self._distance(goal, before) - self._distance(goal, after)
+        goal = self._goal(wanted)
+        far = [self.core.measure.distance(goal, maps) for maps in (before, after.reshape(len(after), -1, *sand)[:, 0])]
+        reward = np.asarray(far[0] - far[1])
         return reward[0] if single else reward
 
-    def _maps(self, name: str, maps: Any, count: int) -> np.ndarray:
-        rows, columns = self.params.scene.grid.shape
-        given = np.asarray(maps)
-        if given.size != count * rows * columns:
-            raise ValueError(
-                f"{name}: got shape {list(given.shape)} for {count} infos; give [{rows}, {columns}] with one info, or "
-                f"[B, {rows}, {columns}] with a list of B infos (each map may be flattened)"
-            )
-        return given.reshape(count, rows, columns)
-
-    def _distance(self, goal: np.ndarray, maps: np.ndarray) -> np.ndarray:
-        return np.asarray(self.core.measure.distance(np.asarray(goal, float), np.asarray(maps, float)))
+    def _goal(self, maps: np.ndarray) -> Goal | np.ndarray:
+        """Goals [B, H, W] of the maps of desired goals, with their own weights, or those that are numbers."""
+        given = self.params.goals.goals
+        if not isinstance(given, Goal):
+            return maps
+        if maps.ndim == 4:
+            return Goal(maps[:, 0], maps[:, 1], maps[:, 2], given.power)
+        return Goal(maps, np.asarray(given.above), np.asarray(given.below), given.power)
 
 
 class ExcavateEnv(_Sand):
     """Excavation as a Gymnasium environment, "jaxsand/Excavate-v0".
 
-    Observations are the maps "goal" and "current" [H, W] in units of the bucket's depth, and "load", what the bucket holds
-    as a share of its capacity. An action holds x0, y0, z0, x1, y1, z1 of a scoop, x, y of a dump, and the share that is
-    poured, from -1 to 1; see `jaxsand.env.Excavate`.
+    Observations are the maps "goal" and "current" [H, W] in units of the bucket's depth, "load", what the bucket holds as a
+    share of its capacity, and weights "above" and "below" of goals where they are maps. An action holds x0, y0, z0, x1, y1,
+    z1 of a scoop, x, y of a dump, and the share that is poured, from -1 to 1; see `jaxsand.env.Excavate`.
 
     Args:
       render_mode: "rgb_array" or None.
@@ -301,7 +306,7 @@ class SandVectorEnv(VectorEnv):
             begun = (*kept, {name: _chosen(which, x, np.zeros_like(x)) for name, x in about.items()})
         obs, self.state, about = begun
         self.shown = _arrays(obs)
-        return _view(self.shown), _masked(_arrays(about), which)
+        return _view(self.core, self.shown), _masked(_arrays(about), which)
 
     def _seeds(self, seed: Any) -> list[int | None]:
         if seed is None or isinstance(seed, int | np.integer):
@@ -334,7 +339,7 @@ class SandVectorEnv(VectorEnv):
         obs, self.state, *rest, info = out
         reward, terminated, truncated = (np.asarray(x) for x in rest)
         info, over = _arrays(info), terminated | truncated
-        last = _view({name: np.asarray(x) for name, x in info.pop("final_observation").items()})
+        last = _view(self.core, _arrays(info.pop("final_observation")))
         del info["terminated"], info["truncated"]
         infos = {}
         if "action_mask" in info:  # of the state as it is now
@@ -348,7 +353,7 @@ class SandVectorEnv(VectorEnv):
                 final[i] = {name: plane[i] for name, plane in last.items()}
             infos |= {"final_obs": final, "_final_obs": over, "final_info": _masked(info, over), "_final_info": over}
         self.shown = _arrays(obs)
-        return _view(self.shown), reward.astype(float), terminated, truncated, infos
+        return _view(self.core, self.shown), reward.astype(float), terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """A picture of each environment; None unless render_mode is "rgb_array"."""
@@ -390,6 +395,18 @@ def picture(core: Core, shown: Obs) -> np.ndarray:
     return np.repeat(np.repeat(whole, scale, 0), scale, 1).round().astype(np.uint8)
 
 
+def _reshaped(name: str, maps: Any, count: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Many maps, or stacks of maps, of a shape, in double precision; raises ValueError if they are not as many."""
+    given = np.asarray(maps, float)
+    if given.size != count * math.prod(shape):
+        one = ", ".join(map(str, shape))
+        raise ValueError(
+            f"{name}: got shape {list(given.shape)} for {count} infos; give [{one}] with one info, or [B, {one}] with a "
+            "list of B infos (each may be flattened)"
+        )
+    return given.reshape(count, *shape)
+
+
 def _renders(mode: str | None) -> str | None:
     """The render mode; raises ValueError if it does not exist."""
     if mode not in (None, "rgb_array"):
@@ -406,7 +423,7 @@ def _coloured(height: np.ndarray) -> np.ndarray:
 def _spaces(core: Core, params: Any) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     """Gymnasium's spaces of an environment's observations and actions."""
     shown, action = core.observation_space(params).spaces, core.action_space(params)
-    observation = spaces.Dict(_view({name: _box(box) for name, box in shown.items()}))
+    observation = spaces.Dict(_view(core, {name: _box(box) for name, box in shown.items()}))
     return observation, _box(action) if isinstance(action, Box) else spaces.Discrete(action.n)
 
 
@@ -414,11 +431,21 @@ def _box(box: Box) -> spaces.Box:
     return spaces.Box(float(box.low), float(box.high), box.shape, np.float32)
 
 
-def _view(shown: Obs) -> Obs:
-    """The observation under Gymnasium's names: a goal dictionary for many strokes, which hold two maps and no more."""
-    if len(shown) > 2:
+def _view(core: Core, shown: Obs) -> Obs:
+    """The observation under Gymnasium's names, or its boxes: a goal dictionary for many strokes."""
+    if not isinstance(core, MultiStroke):
         return dict(shown)
-    return {"observation": shown["current"], "achieved_goal": shown["current"], "desired_goal": shown["goal"]}
+    weights = [shown[side] for side in ("above", "below") if side in shown]
+    achieved, desired = (_stacked([shown[name], *weights]) if weights else shown[name] for name in ("current", "goal"))
+    return {"observation": shown["current"], "achieved_goal": achieved, "desired_goal": desired}
+
+
+def _stacked(maps: list[Any]) -> Any:
+    """Maps [..., H, W] as one array [..., n, H, W], or the box of such of their boxes."""
+    if isinstance(maps[0], spaces.Box):
+        low, high = (np.stack([getattr(box, side) for box in maps]) for side in ("low", "high"))
+        return spaces.Box(low, high, dtype=np.float32)
+    return np.stack(maps, axis=-3)
 
 
 def _arrays(tree: Obs) -> Obs:

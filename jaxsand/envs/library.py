@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.envs.multi import LevelGoals, MultiStroke, RoughGoals
+from jaxsand.envs.weights import heights, pooled
 from jaxsand.envs.zones import NoZones, Zones
 from jaxsand.goals import metrics
+from jaxsand.goals.goal import Goal
 from jaxsand.goals.letters import stroke_list
-from jaxsand.goals.surfaces import rough_surface
-from jaxsand.interaction.outcome import check
-from jaxsand.relaxation.settling import settle_batch
-from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.goals.surfaces import rested, rough_surface
 from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene, blade_of
 
@@ -91,20 +90,23 @@ class Rough:
     scale: float = 3.0
 
 
-Goals = RandomStrokes | Mapping[str, Any] | np.ndarray | jax.Array
-"""Random strokes, or names with strokes [n, 4] of the unit square as a glyph file has them, or maps [G, H, W] (m)."""
+Goals = RandomStrokes | Mapping[str, Any] | np.ndarray | jax.Array | Goal
+"""Random strokes, names with strokes [n, 4] of the unit square as a glyph file has them, maps [G, H, W] (m), or a `Goal`."""
+Starts = Level | Rough | np.ndarray | jax.Array
+"""Level sand, random surfaces, or a map [H, W] or one for each goal [G, H, W] (m)."""
 
 
 def library(
-    env: MultiStroke, scene: Scene, goals: Goals, starts: Level | Rough, seed: int, zones: Zones | None = None
+    env: MultiStroke, scene: Scene, goals: Goals, starts: Starts, seed: int, zones: Zones | None = None
 ) -> LevelGoals | RoughGoals:
     """Makes the pool of goals that an environment draws from; strokes are pushed as the environment pushes them.
 
     Args:
       env: the environment.
       scene: grid, sand and blade.
-      goals: a `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, or maps [G, H, W] (m).
-      starts: `Level()` or `Rough()`.
+      goals: a `RandomStrokes()`, glyphs {name: strokes [n, 4] of the unit square}, a map [H, W] or maps [G, H, W] (m) with
+        NaN in free cells, or a `jaxsand.Goal` of such, whose weights are numbers, a map [H, W] or maps [G, H, W].
+      starts: `Level()`, `Rough()`, or sand at rest: a map [H, W], or one for each goal [G, H, W] (m).
       seed: of all that is drawn.
       zones: where the blade may not be; None for nowhere. Strokes are clipped or refused as the environment does.
 
@@ -112,7 +114,7 @@ def library(
       The goals as `LevelGoals`, or with the surfaces that they start from as `RoughGoals`.
 
     Raises:
-      ValueError: for goals of the wrong type, without any goal, or not of the scene's shape.
+      ValueError: for goals of the wrong type, without any goal, or not of the scene's shape, and for such starts.
 
     Example:
       >>> import numpy as np
@@ -122,49 +124,50 @@ def library(
       >>> pool.goals.shape
       (2, 8, 8)
     """
-    if isinstance(goals, np.ndarray | jax.Array):
-        goals = np.asarray(gaps(goals))
     rng = np.random.default_rng(seed)
-    if isinstance(goals, np.ndarray):
-        if goals.ndim != 3 or not len(goals) or goals.dtype.kind not in "fiub":
-            what = f"shape {list(goals.shape)}" if goals.dtype.kind in "fiub" else f"{goals.dtype}"
-            raise ValueError(f"goals: got {what}; give one or more maps [G, H, W] in metres")
-        metrics.finite(goals, "goals")
-        metrics.fits(scene, goals[0], "goals")
-        plans, count = [], len(goals)
-    elif isinstance(goals, RandomStrokes):
+    if isinstance(goals, np.ndarray | jax.Array | Goal):
+        wanted = pooled(scene, goals)
+        return pool_from(starts, surfaces(scene, starts, len(heights(wanted)), rng), wanted)
+    if isinstance(goals, RandomStrokes):
         plans, count = env.heights.drawn(rng, goals.plans(rng)), goals.goals
     elif isinstance(goals, Mapping):
         plans, count = [stroke_list("goals", name, goals[name]) for name in goals], len(goals)
         if not plans:
             raise ValueError("goals: got no glyph; give names with strokes [[x0, y0, x1, y1], ...]")
     else:
-        raise ValueError(f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, or maps [G, H, W]")
+        raise ValueError(
+            f"goals: got {type(goals).__name__}; give RandomStrokes(), names with strokes, maps [G, H, W], or a Goal of such"
+        )
     before = surfaces(scene, starts, count, rng)
-    after = np.asarray(goals, np.float32) if isinstance(goals, np.ndarray) else _pushed(env, scene, before, plans, zones)
-    return pool_from(starts, before, after)
+    return pool_from(starts, before, _pushed(env, scene, before, plans, zones))
 
 
-def pool_from(starts: Level | Rough, before: np.ndarray, after: np.ndarray) -> LevelGoals | RoughGoals:
-    """The pool of goals `after` [G, H, W] (m) that were made from the surfaces `before`."""
-    if isinstance(starts, Level):
-        return LevelGoals(jnp.asarray(after))
-    return RoughGoals(jnp.asarray(after), jnp.asarray(before))
+def pool_from(starts: Starts, before: np.ndarray, after: np.ndarray | Goal) -> LevelGoals | RoughGoals:
+    """The pool of goals `after` [G, H, W] (m) that are to be made from the surfaces `before`."""
+    wanted = jax.tree.map(jnp.asarray, after)
+    return LevelGoals(wanted) if isinstance(starts, Level) else RoughGoals(wanted, jnp.asarray(before))
 
 
-def surfaces(scene: Scene, starts: Level | Rough, count: int, rng: np.random.Generator) -> np.ndarray:
+def surfaces(scene: Scene, starts: Starts, count: int, rng: np.random.Generator) -> np.ndarray:
     """The surfaces [count, H, W] (m) to start from, at rest."""
-    if not isinstance(starts, Level | Rough):
-        raise ValueError(f"starts: got {starts!r}; give Level() or Rough()")
     shape = (count, *scene.grid.shape)
+    if isinstance(starts, np.ndarray | jax.Array):
+        maps = np.asarray(gaps(starts))
+        if maps.dtype.kind not in "fiub" or maps.ndim not in (2, 3) or (maps.ndim == 3 and len(maps) != count):
+            raise ValueError(
+                f"starts: got {maps.dtype} of shape {list(maps.shape)} for {count} goals; give a map [H, W], or one for "
+                "each goal [G, H, W], in metres"
+            )
+        for start in maps.reshape(-1, *maps.shape[-2:]):
+            metrics.fits(scene, start, "starts")
+        return np.broadcast_to(maps.astype(np.float32), shape)
+    if not isinstance(starts, Level | Rough):
+        raise ValueError(f"starts: got {starts!r}; give Level(), Rough(), or maps of sand at rest")
     if isinstance(starts, Level):
         return np.zeros(shape, np.float32)
     if not (0 <= starts.relief < np.inf and 0 < starts.scale < np.inf):
         raise ValueError(f"starts: got {starts}; give a relief of 0 m or more, and a scale above 0 cells")
-    rough = rough_surface(rng, shape, starts.relief, starts.scale)
-    rested = settle_batch(scene, rough.astype(np.float32), stop=UntilStill(bound=200_000))
-    check(rested)
-    return np.asarray(rested.height)
+    return rested(scene, rough_surface(rng, shape, starts.relief, starts.scale))
 
 
 def _pushed(env: MultiStroke, scene: Scene, maps: np.ndarray, plans: list[np.ndarray], zones: Zones | None) -> np.ndarray:

@@ -11,7 +11,8 @@ from jaxsand.envs import episode
 from jaxsand.envs.episode import Action, Step
 from jaxsand.envs.heights import Heights, OwnDepth
 from jaxsand.envs.pushing import Batching, ByLength, Push, pushing
-from jaxsand.envs.spaces import Box, Dict
+from jaxsand.envs.spaces import Dict
+from jaxsand.envs.weights import Wanted, chosen, heights, shown, shown_spaces
 from jaxsand.envs.zones import NoZones, Told, Zones, kept
 from jaxsand.goals.goal import Goal, Power
 from jaxsand.interaction.stepped import SteppedPush
@@ -63,7 +64,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class WithBerms:
-    """Tells an environment to compare maps as they are, the default: for goals that strokes made.
+    """Tells an environment to compare maps as they are, the default: for goals that strokes made, or that say what matters.
 
     Example:
       >>> import numpy as np
@@ -72,9 +73,9 @@ class WithBerms:
       2.0
     """
 
-    def distance(self, goal: Map, height: Map) -> Map:
-        """The l2 distance [...] (m) of maps [..., H, W] from goals [..., H, W]."""
-        return Goal(goal).distance(height)
+    def distance(self, goal: Map | Goal, height: Map) -> Map:
+        """The distance [...] (m) of maps [..., H, W] from goals [..., H, W]: a `Goal`'s own, or l2 from plain maps."""
+        return (goal if isinstance(goal, Goal) else Goal(goal)).distance(height)
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ class LevelGoals:
     """Goals for level sand at height 0; an episode draws one of them. `library` makes them.
 
     Args:
-      goals: maps [G, H, W] (m).
+      goals: maps [G, H, W] (m), or a `jaxsand.Goal` of such whose weights are numbers or maps [G, H, W].
 
     Example:
       >>> import jax
@@ -149,12 +150,12 @@ class LevelGoals:
       (0.0, 1.0)
     """
 
-    goals: jax.Array
+    goals: Wanted
 
-    def draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def draw(self, key: jax.Array) -> tuple[jax.Array, Wanted]:
         """Draws a map to start from and a goal, both [H, W] (m)."""
-        goal = self.goals[jax.random.randint(key, (), 0, self.goals.shape[0])]
-        return jnp.zeros_like(goal), goal
+        goal = chosen(self.goals, jax.random.randint(key, (), 0, heights(self.goals).shape[0]))
+        return jnp.zeros_like(heights(goal)), goal
 
 
 @jax.tree_util.register_dataclass
@@ -163,7 +164,7 @@ class RoughGoals:
     """Goals, each with the surface that it starts from; an episode draws one of them. `library` makes them.
 
     Args:
-      goals: maps [G, H, W] (m).
+      goals: maps [G, H, W] (m), or a `jaxsand.Goal` of such whose weights are numbers or maps [G, H, W].
       starts: maps [G, H, W] (m), at rest.
 
     Example:
@@ -175,13 +176,13 @@ class RoughGoals:
       (0.0, 1.0)
     """
 
-    goals: jax.Array
+    goals: Wanted
     starts: jax.Array
 
-    def draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def draw(self, key: jax.Array) -> tuple[jax.Array, Wanted]:
         """Draws a map to start from and a goal, both [H, W] (m)."""
-        i = jax.random.randint(key, (), 0, self.goals.shape[0])
-        return self.starts[i], self.goals[i]
+        i = jax.random.randint(key, (), 0, heights(self.goals).shape[0])
+        return self.starts[i], chosen(self.goals, i)
 
 
 @jax.tree_util.register_dataclass
@@ -190,7 +191,7 @@ class StrokeState:
     """The state of an episode of many strokes.
 
     Attributes:
-      goal: [H, W] (m).
+      goal: [H, W] (m), or a `jaxsand.Goal` of it and its weights.
       height: the sand as it lies, [H, W] (m).
       time: strokes so far.
 
@@ -202,7 +203,7 @@ class StrokeState:
       0
     """
 
-    goal: jax.Array
+    goal: Wanted
     height: jax.Array
     time: jax.Array
 
@@ -239,12 +240,14 @@ class MultiStroke:
     An action holds x0, y0, x1, y1, each from -1 to 1, from the first to the last cell centre of the map; numbers beyond that
     push from off the map. With `Heights()` it holds x0, y0, z0, x1, y1, z1, where z, the height of the blade's bottom, rises
     or sinks evenly on the way, from -1 to 1 between heights that the blade's depth gives. Observations are the maps "goal"
-    and "current" [H, W] in units of the blade's depth (float32).
+    and "current" [H, W] in units of the blade's depth, and where goals have weights that are maps, these as "above" and
+    "below" (float32); free cells have weights of 0 and a goal of 0.
 
-    With L the distance of map and goal by `measure`, sqrt(sum (goal - h)^2), in units of the blade's depth, the reward is
-    L_t - L_{t+1}. An episode is truncated after `limit` strokes, and terminated when a `Stop` asks for it. `info` holds the
-    simulator's "outcome", and with zones "clipped" and "went"; see `ClippedBy`. A push that leaves a map that is not finite,
-    leads straight up or down, or may not be made, counts as a stroke and leaves the map as it was.
+    With L the distance of map and goal by `measure`, sqrt(sum (goal - h)^2), or that of a `jaxsand.Goal` by its weights, in
+    units of the blade's depth, the reward is L_t - L_{t+1}. An episode is truncated after `limit` strokes, and terminated
+    when a `Stop` asks for it. `info` holds the simulator's "outcome", and with zones "clipped" and "went"; see `ClippedBy`.
+    A push that leaves a map that is not finite, leads straight up or down, or may not be made, counts as a stroke and leaves
+    the map as it was.
 
     The reward is differentiable once, in forward and reverse mode, in the action, the state's maps and the scene's floats
     (but not where the map equals the goal, nor in the number of a `Stop`), whatever the batching.
@@ -297,17 +300,14 @@ class MultiStroke:
           Observation, state, reward, terminated, truncated, info.
         """
         del key
-        action = jnp.asarray(action, state.height.dtype)
-        if action.shape != (self.size,):
-            raise ValueError(f"action: got shape {list(action.shape)}; give {self.size} numbers")
+        action = episode.checked(self, action, state.height.dtype)
         after, outcome, told = self.pushed(params.scene, state.height, self.stroke(action, params), params.zones)
         after, terminated = self.stop.over(action, state.height, after)
         new = StrokeState(state.goal, after, state.time + 1)
-        reward = self.distance(state, params) - self.distance(new, params)
-        truncated = (new.time >= params.limit) & ~terminated
-        return self.observe(new, params), new, reward, terminated, truncated, {"outcome": outcome} | told
+        return episode.concluded(self, state, new, terminated, params, {"outcome": outcome} | told)
 
     step = episode.step  # `step_env`, and the next episode begins where that ended one
+    action_space = episode.action_space
 
     def pushed(self, scene: Scene, height: jax.Array, stroke: jax.Array, zones: Zones) -> tuple[jax.Array, jax.Array, Told]:
         """The map that a stroke [4] or [6] (m) leaves, its outcome, and what zones have to tell."""
@@ -334,15 +334,9 @@ class MultiStroke:
         return jnp.concatenate([numbers, -jnp.ones(self.stop.more, stroke.dtype)])
 
     def observe(self, state: StrokeState, params: StrokeParams) -> dict[str, jax.Array]:
-        """The observation of a state: its two maps, in units of the blade's depth (float32)."""
-        maps = {"goal": state.goal, "current": state.height}
-        return {name: (x / blade_of(params.scene).depth).astype(jnp.float32) for name, x in maps.items()}
-
-    def action_space(self, params: StrokeParams) -> Box:
-        """The space of actions."""
-        del params
-        return Box(-1, 1, (self.size,))
+        """The observation of a state: its maps in units of the blade's depth, and weights that are maps (float32)."""
+        return shown(state.goal, state.height, blade_of(params.scene).depth)
 
     def observation_space(self, params: StrokeParams) -> Dict:
         """The space of observations."""
-        return Dict({name: Box(-jnp.inf, jnp.inf, params.scene.grid.shape) for name in ("goal", "current")})
+        return Dict(shown_spaces(params.goals.goals, params.scene.grid.shape))

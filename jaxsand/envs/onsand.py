@@ -14,6 +14,7 @@ from jaxsand.goals import metrics
 from jaxsand.interaction.simulate import act
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.pipeline import Layout
+from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Pose, coverage
 
@@ -147,11 +148,10 @@ class OnSand:
     def observe(self, state: SandState, params: SandParams) -> dict[str, jax.Array]:
         """The observation of a state."""
         blade, dx = blade_of(params.scene), jnp.float32(params.scene.grid.spacing)
-        rows, columns = params.scene.grid.shape
-        x, y = ((jnp.arange(n, dtype=jnp.float32) + 0.5) * dx for n in (columns, rows))
+        x, y = centres(params.scene.grid, jnp.float32)
         here = self.at(state.walk.place, params)
         pose = Pose(here[0], here[1], jnp.ones_like(here[0]), jnp.zeros_like(here[0]))
-        cover = coverage(blade, pose, jnp.broadcast_to(x[None], (rows, columns)), y[:, None], dx)
+        cover = coverage(blade, pose, jnp.broadcast_to(x, params.scene.grid.shape), y, dx)
         maps = {"goal": self.goal(state.walk, params) / blade.depth, "current": state.height / blade.depth, "pose": cover}
         return {name: plane.astype(jnp.float32) for name, plane in maps.items()}
 

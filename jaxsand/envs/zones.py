@@ -40,6 +40,11 @@ class NoZones:
         return {}
 
 
+def _over(zones: "ClippedBy | RefusedBy", point: jax.Array, grid: Grid) -> Told:
+    """Whether a bucket may be emptied over a point x, y (m): sand falls on none of the zones' cells then."""
+    return {"poured": ~free_way(zones.cells, grid, point, point, grid.spacing, grid.spacing)[0]}
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ClippedBy:
@@ -79,9 +84,7 @@ class ClippedBy:
         made = jnp.concatenate([start, jnp.where(met, start + share * (stop - start), stop)])
         return made, {"clipped": met, "went": share}
 
-    def over(self, point: jax.Array, grid: Grid) -> Told:
-        """Whether a bucket may be emptied over a point x, y (m)."""
-        return {"poured": _outside(self.cells, point, grid)}
+    over = _over
 
 
 @jax.tree_util.register_dataclass
@@ -110,9 +113,7 @@ class RefusedBy:
         met, _ = free_way(self.cells, grid, start[:2], stop[:2], width, thickness)
         return stroke, {"clipped": met, "went": jnp.where(met, 0, jnp.ones_like(start[0]))}
 
-    def over(self, point: jax.Array, grid: Grid) -> Told:
-        """Whether a bucket may be emptied over a point x, y (m)."""
-        return {"poured": _outside(self.cells, point, grid)}
+    over = _over
 
 
 Zones = NoZones | ClippedBy | RefusedBy
@@ -123,8 +124,3 @@ def kept(told: Told, name: str, before: Tree, after: Tree) -> Tree:
     if name not in told:
         return after
     return jax.tree.map(lambda old, new: jnp.where(told[name] > 0, new, old), before, after)
-
-
-def _outside(cells: jax.Array, point: jax.Array, grid: Grid) -> jax.Array:
-    """Whether none of the cells around a point x, y (m), on which sand falls that is poured there, is one of `cells`."""
-    return ~free_way(cells, grid, point, point, grid.spacing, grid.spacing)[0]

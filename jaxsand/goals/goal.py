@@ -32,8 +32,8 @@ class Goal:
 
     Args:
         height: g [H, W] (m), with g[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx; or maps [B, H, W].
-        above: a, the weight of sand above the goal, 0 or more: a number or a map [H, W].
-        below: b, the weight of sand below the goal, 0 or more: a number or a map [H, W].
+        above: a, the weight of sand above the goal, 0 or more: a number or a map [H, W]; or maps [B, H, W].
+        below: b, the weight of sand below the goal, 0 or more: likewise.
         power: p, 2 or 1. Squares spread what is left evenly; with 1 the cost is a mean difference, and a few cells may be
             far off.
 
@@ -69,29 +69,59 @@ class Goal:
 
     @property
     def free(self) -> Any:
-        """Which cells may have any height, booleans [H, W]."""
+        """Which cells may have any height.
+
+        Returns:
+            Booleans [H, W], or [B, H, W] for a batch of goals.
+        """
         return _space(self.height).isnan(self.height) | ((self.above == 0) & (self.below == 0))
 
     def off(self, height: Maps) -> Maps:
-        """How far a map [..., H, W] stands above the goal where that costs, below 0 where it stands below (m); 0 elsewhere.
+        """How far a map stands from the goal where that costs.
 
-        `height - off(height)` is the nearest map that costs nothing. A height that is not finite stays so.
+        Args:
+            height: [..., H, W] (m).
+
+        Returns:
+            [..., H, W] (m): above 0 where the sand is too high, below 0 where it is too low, and 0 where that costs nothing.
+            `height - off(height)` is the nearest map that costs nothing. A height that is not finite stays so.
         """
         xp, apart = _space(height, self.height), self.apart(height)
         costs = ((apart > 0) & (xp.asarray(self.above) > 0)) | ((apart < 0) & (xp.asarray(self.below) > 0))
         return xp.where(costs | ~xp.isfinite(apart), apart, 0)
 
     def apart(self, height: Maps) -> Maps:
-        """How far a map [..., H, W] stands above the goal (m), whether or not that costs; 0 where the goal is NaN."""
+        """How far a map stands above the goal, whether or not that costs.
+
+        Args:
+            height: [..., H, W] (m).
+
+        Returns:
+            [..., H, W] (m), 0 where the goal is NaN.
+        """
         xp = _space(height, self.height)
         return height - xp.where(xp.isnan(self.height), height, self.height)
 
     def weight(self, off: Maps) -> Maps:
-        """The weight that differences of this sign have: of the one above where `off` is above 0, else of the one below."""
+        """The weight that differences of these signs have.
+
+        Args:
+            off: differences [..., H, W] (m), as of `apart`.
+
+        Returns:
+            [..., H, W]: the weight `above` where `off` is above 0, else `below`.
+        """
         return _space(off, self.above, self.below).where(off > 0, self.above, self.below)
 
     def residual(self, height: Maps) -> tuple[Maps, Maps]:
-        """Differences r such that the cost is sum |r|^p, and their derivatives by the heights."""
+        """Differences such that the cost is sum |r|^p, for methods of least squares.
+
+        Args:
+            height: [..., H, W] (m).
+
+        Returns:
+            r [..., H, W], and their derivatives by the heights, 0 beside a kink at the goal.
+        """
         off = self.off(height)
         rate = self.weight(off) ** (1 / self.power)
         xp = _space(off, rate)
@@ -99,18 +129,39 @@ class Goal:
         return off * rate, xp.where((off == 0) & ~one, 0, rate)  # beside a kink, a cell at the goal may go either way
 
     def cost(self, height: Maps) -> Maps:
-        """J of maps [..., H, W]: [...] (m^2, or m for p = 1)."""
+        """What a map costs, J.
+
+        Args:
+            height: [..., H, W] (m).
+
+        Returns:
+            [...] (m^2, or m for p = 1).
+        """
         apart = self.apart(height)
         size = apart**2 if self.power == 2 else abs(apart)
         return (self.weight(apart) * size).sum((-2, -1))
 
     def slope(self, height: Maps) -> Maps:
-        """The derivative of the cost by the heights, [..., H, W]; 0 at the goal."""
+        """The derivative of the cost by the heights.
+
+        Args:
+            height: [..., H, W] (m).
+
+        Returns:
+            [..., H, W] (m, or a number for p = 1), 0 at the goal.
+        """
         off = self.off(height)
         return self.weight(off) * (2 * off if self.power == 2 else _space(off).sign(off))
 
     def distance(self, height: Maps) -> Maps:
-        """J^(1/p) of maps [..., H, W]: [...] (m)."""
+        """How far a map is from the goal, J^(1/p).
+
+        Args:
+            height: [..., H, W] (m).
+
+        Returns:
+            [...] (m), 0 at the goal.
+        """
         cost = self.cost(height)
         if self.power == 1:
             return cost

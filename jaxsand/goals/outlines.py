@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.scene.grid import Grid
+from jaxsand.scene.grid import Grid, places
 
 _ROUNDING = 1e-9  # cells: what lies closer to an outline lies on it
 
@@ -37,8 +37,8 @@ def inside(corners: np.ndarray, grid: Grid) -> Mask:
 def ring(centre: tuple[float, float], inner: float, radius: float, grid: Grid) -> Mask:
     """The cells from `inner` up to, but not at, `radius` (m) from a centre (m)."""
     spacing = float(grid.spacing)
-    y, x = ((np.arange(n) + 0.5) * spacing for n in grid.shape)
-    distance = np.hypot(x - centre[0], y[:, None] - centre[1]) + _ROUNDING * spacing
+    x, y = places(grid.shape, spacing)
+    distance = np.hypot(x - centre[0], y - centre[1]) + _ROUNDING * spacing
     return (inner <= distance) & (distance < radius)
 
 

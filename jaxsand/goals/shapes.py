@@ -9,8 +9,7 @@ import numpy as np
 from jaxsand.goals.fields import LENGTH, METRES, POINT, Flag, Number, Pair, Points, Several, Text, read_object, wrong
 from jaxsand.goals.letters import letter_strokes, text_strokes
 from jaxsand.goals.outlines import Mask, inside, near, ring, strip
-from jaxsand.goals.surfaces import places
-from jaxsand.scene.grid import Grid
+from jaxsand.scene.grid import Grid, places
 
 WEIGHT = Number("a weight from 0 to 1e6", 0, 1e6)
 """Of sand above a goal, or below it."""
@@ -26,7 +25,8 @@ class Shape(Protocol):
     """
 
     @property
-    def weights(self) -> tuple[float, float]: ...
+    def weights(self) -> tuple[float, float]:
+        """The weights of sand above the shape and of sand below it."""
 
     def check(self, name: str) -> None:
         """ValueError, with the shape's name in the drawing, where its fields do not go together."""

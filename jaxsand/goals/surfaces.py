@@ -7,9 +7,12 @@ from scipy.ndimage import gaussian_filter
 
 from jaxsand.goals import metrics
 from jaxsand.interaction.outcome import check
-from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.settling import settle, settle_batch
 from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.scene.grid import places
 from jaxsand.scene.scene import Scene
+
+__all__ = ["places", "rested", "rough_surface", "terrain", "terrain_surface"]
 
 
 def rough_surface(rng: np.random.Generator, shape: tuple[int, ...], relief: float, scale: float) -> np.ndarray:
@@ -46,17 +49,12 @@ def terrain_surface(shape: tuple[int, int], relief: float) -> np.ndarray:
 
 
 def rested(scene: Scene, surface: np.ndarray) -> np.ndarray:
-    """A surface [H, W] (m) after it has settled, in float32.
+    """A surface, or a batch of them, [..., H, W] (m), after it has settled, in float32.
 
     Raises:
       OutcomeError: if the sand does not come to rest.
     """
-    settled = settle(scene, surface.astype(np.float32), stop=UntilStill(bound=200_000))
+    run = settle if surface.ndim == 2 else settle_batch
+    settled = run(scene, surface.astype(np.float32), stop=UntilStill(bound=200_000))
     check(settled)
     return np.asarray(settled.height)
-
-
-def places(shape: tuple[int, int], spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where the cells of a map lie: their x and their y, each [H, W] (m)."""
-    x, y = np.meshgrid((np.arange(shape[1]) + 0.5) * spacing, (np.arange(shape[0]) + 0.5) * spacing)
-    return x, y

@@ -58,6 +58,9 @@ def make_task(name: str, key: int = 0) -> Task:
         name: one of `TASKS`.
         key: 0 or more; each makes another instance.
 
+    Returns:
+        The task: its scene, start, goal, the cells to be shaped, and how many strokes it allows.
+
     Raises:
         ValueError: for a name that does not exist, or a key below 0.
 
@@ -86,6 +89,9 @@ def figures(task: Task, height: Map) -> dict[str, float | None]:
     Args:
         task: the task.
         height: the map [H, W] (m) that came of it.
+
+    Returns:
+        The measures by name; lengths in mm but for `distance`, shares from 0 to 1.
 
     Raises:
         ValueError: for a map of another shape.

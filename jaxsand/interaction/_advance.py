@@ -52,6 +52,7 @@ class Disturbed:
     part: jax.Array
 
     def openness(self) -> Openness:
+        """What the next sub-step needs to know of how the tool stands here."""
         return Openness(self.sand.gates, self.sand.open, self.sand.stretch)
 
 
@@ -97,6 +98,7 @@ class LegStep(Generic[L]):
 
     @property
     def together(self) -> int:
+        """How many maps of a batch are computed at a time."""
         return self.block.together
 
     def kept(self, part: jax.Array, flux: Fluxes, before: Fluxes) -> Fluxes:
@@ -111,12 +113,15 @@ class LegStep(Generic[L]):
         raise NotImplementedError
 
     def recorded(self, leg: L, k: jax.Array, sand: Moving, /) -> tuple[Moving, StepRecord]:
+        """The sand after step k, and the sand before it as the record."""
         return self(leg, k, sand), sand
 
     def jvp(self, leg: L, k: jax.Array, record: StepRecord, dleg: Floats, dsand: Moving, /) -> Moving:
+        """The jvp, by JAX."""
         return Plain(self).jvp(leg, k, record, dleg, dsand)
 
     def vjp(self, leg: L, k: jax.Array, record: StepRecord, cotangent: Moving, /) -> tuple[Floats, Moving]:
+        """The vjp, by JAX."""
         return Plain(self).vjp(leg, k, record, cotangent)
 
 
@@ -134,6 +139,7 @@ class Advance(LegStep[Way]):
     rest: Rest = bring_to_rest
 
     def done(self, way: Way, k: jax.Array, _: Moving) -> jax.Array:
+        """Whether the leg is complete before step k."""
         gone = (k - int(self.lowered)).astype(way.length.dtype) * (self.chunk * self.substep)
         return (k >= int(self.lowered)) & jnp.all(gone >= way.length)
 
@@ -141,6 +147,7 @@ class Advance(LegStep[Way]):
         return self.recorded(way, k, sand)[0]
 
     def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, StepRecord]:
+        """The sand after step k, and what its derivative needs."""
         frame = frame_of(self.block.shape, way.start)
         first, by = self.block_of(way, frame, k)
         view, old = self.block.view(way, frame, first, sand.height)
@@ -275,6 +282,7 @@ class Advance(LegStep[Way]):
         return (way.bottom + (by - past) * way.rise) / way.quantum
 
     def jvp(self, way: Way, k: jax.Array, record: StepRecord, dway: Floats, dsand: Moving) -> Moving:
+        """The jvp: of the step made again in its block."""
         if isinstance(record, Moving):
             return super().jvp(way, k, record, dway, dsand)
         inside = _Inside(self, way, k, record)
@@ -290,6 +298,7 @@ class Advance(LegStep[Way]):
         return Moving(height, None, flux, dsand.edge)
 
     def vjp(self, way: Way, k: jax.Array, record: StepRecord, cotangent: Moving) -> tuple[Floats, Moving]:
+        """The vjp: of the step made again in its block."""
         if isinstance(record, Moving):
             return super().vjp(way, k, record, cotangent)
         inside = _Inside(self, way, k, record)

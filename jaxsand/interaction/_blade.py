@@ -65,8 +65,10 @@ def _to(s: jax.Array) -> jax.Array:
 
 
 def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Array) -> Reach:
-    """The footprints of a blade of half the thickness `half` (spacings) that moves straight ahead.
+    """The footprints of a blade that moves straight ahead, by `ahead` (spacings).
 
+    `along` is how far each cell lies ahead of the blade's middle plane before it moves, and `half` half of the blade's
+    thickness (spacings); `beside` is the share of each cell that lies between the blade's two ends, by its distance across.
     A footprint is the product of two intervals, along and across, each smoothed over one spacing: exact for headings along
     the grid, a first-order approximation otherwise. It is continuous and piecewise linear.
     """
@@ -77,9 +79,11 @@ def straight(along: jax.Array, beside: jax.Array, half: jax.Array, ahead: jax.Ar
 
 
 def boxed(reach: Reach, across: jax.Array, half: jax.Array, side: jax.Array, plates: jax.Array, ahead: jax.Array) -> Reach:
-    """The footprints of a blade whose ends carry plates a cell thick, which reach `plates` ahead of its face (spacings).
+    """The footprints of a blade with plates at its ends, a cell thick, that reach `plates` ahead of its face (spacings).
 
-    `reach` are the footprints without them, of a blade that moves straight ahead.
+    `reach` are the footprints of the same blade without plates, which moved straight ahead by `ahead` (spacings). `across`
+    is how far each cell lies to the left of the blade's middle, `half` half of its thickness, and `side` half of its width,
+    so that the plates lie from `side` to `side + 1` on both sides (all in spacings).
     """
     beside = share(across, side, side + 1) + share(across, -side - 1, -side)
     rear, front = _to(reach.along + ahead + half), _to(reach.along + ahead - half - plates)

@@ -123,21 +123,6 @@ class Openness:
     stretch: jax.Array
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Carried:
-    """Sand under a tool that moves outwards, cell by cell (quanta): the `height` of each cell, what each `lost` over a rim
-    (None where the edge is closed), and what is still `carried`."""
-
-    height: jax.Array
-    lost: jax.Array | None
-    carried: jax.Array
-
-    def moves(self) -> jax.Array:
-        """Whether any sand is still being carried."""
-        return jnp.any(self.carried > 0)
-
-
 First = tuple[jax.Array, jax.Array]
 
 

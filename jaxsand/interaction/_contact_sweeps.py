@@ -17,7 +17,7 @@ from jax import lax
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.flux import ToolInSand, flows
-from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, halo, stored
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, halo, stored, total
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 
@@ -37,12 +37,15 @@ class Beside:
         return repeat(_SWEEP, self.sweeps, params, state)
 
     def recorded(self, params: Params, k: jax.Array, state: State) -> tuple[State, State]:
+        """The state after the sweeps, and the state before them as the record."""
         return self(params, k, state), state
 
     def jvp(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
+        """The jvp, by JAX."""
         return Plain(self).jvp(params, k, record, dparams, dstate)
 
     def vjp(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
+        """The vjp: written out for 4 and 8 neighbours, else by JAX."""
         bed, flow, tool = params
         if not bed.by_links or not self.sweeps:
             return Plain(self).vjp(params, k, record, cotangent)
@@ -135,12 +138,12 @@ def vjp(bed: Bed, flow: Flow, tool: ToolInSand, tape: jax.Array, cotangent: jax.
             bed, [flow.rate * g / length * t for g, length, t in zip(gates, lengths, tilt, strict=True)]
         )
     else:
-        drop = flow.rate * flux_adjoint.total(tilt[0])
+        drop = flow.rate * total(tilt[0])
     return SweepCotangents(
         gain,
         -flow.rate * at(flux_adjoint.to_less_open(bed, tool.open, per_length)),
         moved / (1 + tool.stretch),
         -flux_adjoint.to_shape(lift * tool.stretch, tool.bottom),
-        -flux_adjoint.total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
+        -total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
         drop,
     )

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import repeat
+from jaxsand.autodiff.while_loop import Tree, repeat
 from jaxsand.interaction._contact_sweeps import Beside
 from jaxsand.relaxation.flux import tool_in_sand
 from jaxsand.relaxation.ghost_cells import Bed, ExactSum, truncate
@@ -20,6 +20,27 @@ from jaxsand.relaxation.sweep import Flow
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Carried:
+    """Sand that moves on from under a tool, cell by cell (quanta).
+
+    Attributes:
+        height: of each cell.
+        lost: what each has lost over a rim, or None where the edge is closed.
+        carried: what is still being carried.
+    """
+
+    height: jax.Array
+    lost: jax.Array | None
+    carried: jax.Array
+
+
+def none_carried(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
+    """Whether no sand is being carried any more."""
+    return ~jnp.any(state.carried > 0)
 
 
 @jax.tree_util.register_dataclass

@@ -25,15 +25,19 @@ class Repeated(Step, Protocol):
     """A step that is repeated until it is done."""
 
     @property
-    def block(self) -> Block: ...
+    def block(self) -> Block:
+        """The block of cells in which the step works."""
 
     @property
-    def substep(self) -> float: ...
+    def substep(self) -> float:
+        """How far a sub-step leads (spacings)."""
 
     @property
-    def keeps(self) -> bool: ...
+    def keeps(self) -> bool:
+        """Whether fluxes are kept for a later leg."""
 
-    def done(self, params: Any, k: jax.Array, sand: Moving, /) -> jax.Array: ...
+    def done(self, params: Any, k: jax.Array, sand: Moving, /) -> jax.Array:
+        """Whether the step has been repeated often enough before step k."""
 
 
 @dataclass(frozen=True)

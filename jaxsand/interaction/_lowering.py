@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._advance import LegStep
-from jaxsand.interaction._block import Carried, Moving, Way, normal_of
+from jaxsand.interaction._block import Moving, Way, normal_of
+from jaxsand.interaction._displacement import Carried, none_carried
 from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at, truncate
@@ -49,7 +50,7 @@ class Lower(LegStep[Way]):
         params = (shares, holds, cover, over)
         into, scooped = blade.scooped(way.room, sand.scooped, taken)
         state = Carried(old - taken, gone, taken - into)
-        state, _ = repeat_until(_at_rest, Plain(_spread, 16), 2 * self.block.near, params, state)
+        state, _ = repeat_until(none_carried, Plain(_spread, 16), 2 * self.block.near, params, state)
         gone, new = state.lost, self.block.put(whole, state.height + state.carried)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, whole, new, cover))
         lost = self.block.lose(way, view, sand.lost, None if gone is None else self.block.put(jnp.zeros_like(whole), gone))
@@ -64,8 +65,3 @@ def _spread(params: Params, k: jax.Array, state: Carried) -> Carried:
     rest = truncate((1 - cover) * got)
     h = state.height + rest + kept
     return Carried(h, None if state.lost is None or lost is None else state.lost + lost, got - rest)
-
-
-def _at_rest(params: Params, k: jax.Array, state: Carried) -> jax.Array:
-    """Whether no sand is being carried any more."""
-    return ~state.moves()

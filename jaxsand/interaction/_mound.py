@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from jaxsand.relaxation.ghost_cells import total
+
 Holds = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 _STEPS = 2  # Newton steps; few suffice, since the volume is a convex function of the reach
 _FARTHEST = 64.0  # the largest reach, over that on an unbounded map and a cell
@@ -66,7 +68,7 @@ def unbounded(volume: jax.Array, width: jax.Array, open_: jax.Array, dx: jax.Arr
 def held(where: Lean, reach: jax.Array, dx: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The sum of a mound's heights over cells, divided by mu, and its derivative by the reach."""
     part, above = _parts(where, reach, dx)
-    return _sum(part**2 / (2 * dx) + where.share * above), _sum(part) / dx
+    return total(part**2 / (2 * dx) + where.share * above), total(part) / dx
 
 
 def _parts(where: Lean, reach: jax.Array, dx: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -74,10 +76,6 @@ def _parts(where: Lean, reach: jax.Array, dx: jax.Array) -> tuple[jax.Array, jax
     z, b = reach - where.far, where.share * dx / 2
     start, end = z + b, z - b
     return jnp.where(end > 0, 2 * b, jnp.where(start > 0, start, 0)), jnp.where(end > 0, end, 0)
-
-
-def _sum(x: jax.Array) -> jax.Array:
-    return jnp.sum(jnp.sum(x, axis=0))  # rows first: XLA vectorises that
 
 
 def reach_of(volume: jax.Array, start: jax.Array, holds: Holds, dx: jax.Array) -> jax.Array:

@@ -39,6 +39,7 @@ class RimAhead:
 
     @classmethod
     def of(cls, scene: Scene, site: Site, ground: jax.Array, sand: jax.Array, seen: jax.Array) -> "RimAhead":
+        """The rim of a scene that drains, before the leg."""
         assert site.bed.rim is not None
         dx, (rows, columns) = site.bed.spacing, scene.grid.shape
         return cls((columns * dx, rows * dx), site.bed.rim.level, ground, jnp.ones(2, sand.dtype), _from_edge(sand), seen)

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsand.autodiff.while_loop import Plain, Tree, repeat_until
+from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _wheel as wheel
 from jaxsand.interaction._advance import LegStep
-from jaxsand.interaction._block import Block, Carried, Moving, View, pose_ahead, rotated
+from jaxsand.interaction._block import Block, Moving, View, pose_ahead, rotated
+from jaxsand.interaction._displacement import Carried, none_carried
 from jaxsand.interaction._frame import Frame, frame_of, shifted
 from jaxsand.interaction._wheel import Placed, Track
 from jaxsand.interaction.resting import bring_to_rest
@@ -44,7 +45,7 @@ class Touchdown(LegStep[Track]):
         gone = None if view.beyond is None else jnp.zeros_like(old)
         onward = Plain(_Onward(self.block), 16)
         params = (track, view, wheel.radial(track, frame, here), here)
-        state, _ = repeat_until(_at_rest, onward, 2 * self.block.size, params, Carried(old - taken, gone, taken))
+        state, _ = repeat_until(none_carried, onward, 2 * self.block.size, params, Carried(old - taken, gone, taken))
         gone, new = state.lost, state.height + state.carried
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, here.cover))
         lost = self.block.lose(way, view, sand.lost, gone)
@@ -60,11 +61,6 @@ class _Onward:
     def __call__(self, params: tuple[Track, View, wheel.Shares, Placed], k: jax.Array, state: Carried) -> Carried:
         track, view, shares, here = params
         return wheel.handed_on(self.block, track, view, shares, here, state)
-
-
-def _at_rest(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
-    """Whether no sand is being carried any more."""
-    return ~state.moves()
 
 
 @dataclass(frozen=True)

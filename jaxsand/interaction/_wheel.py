@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._block import Block, Carried, First, View, Way
+from jaxsand.interaction._block import Block, First, View, Way
+from jaxsand.interaction._displacement import Carried
 from jaxsand.interaction._frame import Frame
 from jaxsand.interaction.resting import Sand
 from jaxsand.interaction.stencil import inner, outer, seen, spread

@@ -1,21 +1,8 @@
 """A blade's whole leg in closed form: its swath is taken up and set down as berms, as a heap ahead, and behind the start.
 
-The blade pushes a heap of height H before it (_mound.py). What sticks out of the heap's two flanks is left behind as berms,
-triangles at repose of cross section H^2 / (2 mu) each, mu = tan(angle of repose). A blade of width w that cuts d deep is in
-balance when they take what it cuts, w d:
-
-    H = sqrt(w d mu),   r = H / mu,   V_h = w H^2 / (2 mu) + (pi / 6) H^3 / mu^2,   l = V_h / (w d) = w / 2 + (pi / 6) r
-
-with r the berms' and the heap's reach and V_h the heap: a wedge across the blade and a quarter of a cone at each end. A
-heap of volume V leaves V / l to a unit of length, so that along the stroke, with intake q(s),
-
-    dV/ds = q(s) - a V / l,   l = w / 2 + (pi / 6) a r,
-
-a the share of the two flanks where a berm finds room. Beside walls or a closed edge a = 0: the heap keeps all, as the
-right triangle of peak sqrt(2 mu V / w) over its channel. By symmetry half a blade beside a wall is a blade twice as
-wide. Over a draining edge what stands beyond it or above its rim runs off (_overflow.py). A heap without room goes back
-to where it was taken from. Every amount is a whole number of quanta and what the cuts leave over goes to one cell, so
-that volume is kept as well as floats allow.
+The balance of heap and berms, H = sqrt(w d mu), and what walls and edges change: notebooks/site/theory/closed-forms.md
+("A blade's swath"). The heap is in _mound.py, what runs off over a draining edge in _overflow.py. Every amount is a whole
+number of quanta and what the cuts leave over goes to one cell, so that volume is kept as well as floats allow.
 """
 
 import math
@@ -34,7 +21,7 @@ from jaxsand.interaction._overflow import RimAhead, nothing_beyond
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._shade import on_line, within_reach
 from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
-from jaxsand.relaxation.ghost_cells import ExactSum, lose
+from jaxsand.relaxation.ghost_cells import ExactSum, lose, total
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene, deep
@@ -229,7 +216,7 @@ def _sweep_out(  # noqa: PLR0915
     room = rooms[:2] + rooms[2:] + beyond
     density = (left_there / jnp.where(flanks > 0, 2 * flanks, 1))[None] * open_ / jnp.where(room > 0, room, 1)
     put = of_slices(at, left, density * (dx / thick)) * (outside + inside)
-    wanted, there = jnp.sum(density * (room - beyond)), jnp.sum(jnp.sum(put, axis=0))
+    wanted, there = jnp.sum(density * (room - beyond)), total(put)
     scale = wanted / jnp.where(wanted > 0, jnp.maximum(there, wanted / 2), 1)
     heap, kept, gone = _heap(site, pose, end, heaped, h, seen, open_ @ there_end, width, mu, rim)
     put, kept = put * scale + ring + heap, kept + jnp.maximum(wanted - 2 * there, 0)

@@ -194,7 +194,14 @@ def dump(
 
 
 def load_volume(scene: Scene, load: Load | None) -> Float[Array, "*batch"]:
-    """The volume (m^3) that a bucket holds; 0 for None.
+    """The volume that a bucket holds.
+
+    Args:
+        scene: the scene in which it was loaded; its spacing counts.
+        load: what a `Loaded` has as its `load`, or a batch of them; None for an empty bucket.
+
+    Returns:
+        The volume (m^3), a scalar, or one for each of the batch. Differentiable in the load and in the spacing.
 
     Example:
         >>> import jaxsand as js
@@ -209,6 +216,7 @@ def load_volume(scene: Scene, load: Load | None) -> Float[Array, "*batch"]:
 
 
 def bucket_of(scene: Scene) -> Bucket:
+    """The scene's bucket; raises ValueError where its tool is another."""
     check_scene(scene)
     if not isinstance(scene.tool, Bucket):
         raise ValueError(

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import heading
-from jaxsand.relaxation.ghost_cells import Bed, ExactSum, counted, largest, mark, prepare, quantum, truncate, unmark
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, counted, largest, mark, prepare, quantum, total, truncate, unmark
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
@@ -76,10 +76,25 @@ def remove(
     scheme: Scheme | None = None,
     stop: Stop | None = None,
 ) -> Settled:
-    """Takes sand away and lets the rest settle: the opposite of `deposit`, with the same arguments.
+    """Takes sand away and lets the rest settle: the opposite of `deposit`.
 
-    A volume V lowers cell [i, j] by V w[i, j] / (dx^2 sum w). On a floor (`Base`) a cell gives no more than lies on it, and
-    the others give the rest in the same proportions; where that is not enough, the outcome says NOT_POURED.
+    A volume V lowers cell [i, j] by V w[i, j] / (dx^2 sum w), with the weights w of `deposit`. On a floor (`Base`) a cell
+    gives no more than lies on it, and the others give the rest in the same proportions. Differentiable as `deposit` is.
+
+    Args:
+        scene: the scene; its tool does not matter.
+        height: height map [H, W] (m), with height[i, j] at x = (j + 1/2) dx, y = (i + 1/2) dx.
+        where: a point [2] = x, y (m), or a footprint: weights [H, W] of 0 or more, such as the share of each cell.
+        volume: how much sand (m^3), 0 or more.
+        scheme: scheme of settling, as of `settle`.
+        stop: stop rule of settling, as of `settle`.
+
+    Returns:
+        The settled map, and how settling went. The outcome says NOT_POURED where there is less sand than `volume`: all that
+        there is is taken then. It says so too where all weights are 0, and the map is then as if no sand had gone.
+
+    Raises:
+        ValueError: an argument has the wrong shape or is out of range.
 
     Example:
         >>> import jax.numpy as jnp
@@ -153,11 +168,11 @@ def _on_floor(bed: Bed, height: jax.Array, weights: jax.Array, amount: jax.Array
     spare = 4 * quantum(2 * (largest(height) + most))  # so that rounding takes no cell below its floor
     thick = jnp.where((thick > spare) & (weights > 0), thick - spare, 0)
     weights = weights / jnp.where(jnp.max(weights) > 0, jnp.max(weights), 1)
-    most = jnp.sum(jnp.sum(thick, axis=0))
+    most = total(thick)
 
     def scale(empty: jax.Array) -> jax.Array:
-        left = amount - jnp.sum(jnp.sum(jnp.where(empty, thick, 0), axis=0))
-        share = jnp.sum(jnp.sum(jnp.where(empty, 0, weights), axis=0))
+        left = amount - total(jnp.where(empty, thick, 0))
+        share = total(jnp.where(empty, 0, weights))
         return jnp.where(share > 0, jnp.maximum(left, 0) / jnp.where(share > 0, share, 1), jnp.inf)
 
     def once(_: jax.Array, empty: jax.Array) -> jax.Array:
@@ -184,7 +199,7 @@ def poured(
     weights = jnp.where(sound & ~jnp.isnan(marked), jnp.maximum(weights, 0), 0)
     most = jnp.max(weights)
     weights = weights / jnp.where(most > 0, most, 1)
-    whole = jnp.sum(jnp.sum(weights, axis=0), axis=0)
+    whole = total(weights)
     asked, there = jnp.where(sound, amount, 0), jnp.where(sound, there, 0)
     given = jnp.where(whole > 0, jnp.minimum(asked, there), 0)
     share = weights / jnp.where(whole > 0, whole, 1)
@@ -203,7 +218,7 @@ def poured(
     more = jnp.trunc(lax.stop_gradient(share) * rest())
     put, account = put + more, counted(account, more)
     left = rest()
-    number = jnp.cumsum((share > 0).ravel()).reshape(share.shape)
+    number = jnp.cumsum((share > 0).ravel().astype(share.dtype)).reshape(share.shape)
     more = jnp.where((share > 0) & (number <= jnp.abs(left)), jnp.sign(left), 0)
     put, account = put + more, counted(account, more)
     last = rest()

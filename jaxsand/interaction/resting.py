@@ -1,28 +1,8 @@
-"""Brings sand to rest around a tool that moves slowly, by proximal gradient steps.
+"""Brings sand to rest around a tool that moves slowly, by proximal gradient steps from the fluxes of the last sub-step.
 
-In the quasi-static limit sand flows only over links at repose, and no slope exceeds repose. For a sub-step in which a tool
-changes the heights to h, the limit is (one implicit step of Prigozhin's model, doi:10.1016/0009-2509(96)00259-5)
-
-    h' = h + G f,   f = argmin over f of |h + G f|^2 / 2 + sum over links of m |f|,
-
-where m is the largest stable step of a link, f the flux over it and G f what cells gain: h' is the map nearest to h whose
-slopes are within repose. With D the steps over links, the proximal gradient steps
-
-    f <- S(f + r w D (h + G f), r w m),   S(z, t) = z - clip(z, -t, t)
-
-converge to it from any start, since r w is below 2 / |G|^2, the limit of a sweep of settling. Unlike a sweep of settling,
-such a step can take back a flux that was too large, and so can start from a guess. The guess is the flux of the last
-sub-step: around a tool that moves steadily, fluxes change little. Then a few steps suffice, however far the heap reaches.
-Isotropic sand has a flux along each of the four one-sided gradients of a cell, whose length S shortens.
-
-The weight w of a link is its open share. A cell with the open share o rises by 1 / o of what it gains. Steps are stable if
-for every f the sum over cells of (sum of f)^2 / o is at most the sum over links of 2 f^2 / (r w). With n open links to a
-cell this is r n <= 1. Else it holds if 2 / w >= 1 / o + 1 / o' for the two ends of each link: w is at most their harmonic
-mean. Isotropic sand couples two links in a gradient, which need one common weight: both the step and the flux of a link are
-multiplied by a factor a, below 1 only where the link is nearly closed, and the weight is the lesser of the two links' w /
-a^2. Fluxes are whole quanta (ghost_cells.py).
-
-On a floor no cell gives more than it held before the steps (floor.py).
+The limit, the steps f <- S(f + r w D (h + G f), r w m), and the weights w that keep them stable in narrow cells:
+notebooks/site/theory/push.md ("The limit" to "Weights of narrow cells"). Fluxes are whole quanta (ghost_cells.py). On a
+floor no cell gives more than it held before the steps (floor.py).
 """
 
 from dataclasses import dataclass, field
@@ -141,6 +121,7 @@ class Links:
         return tuple(out) if self.there is None else no_more_than(neighbours, self.there, out)
 
     def gained(self, flux: Fluxes) -> jax.Array:
+        """What each cell gains from fluxes."""
         return _gained(self.sand, flux)
 
 

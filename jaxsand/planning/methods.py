@@ -10,20 +10,45 @@ from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Planned, Stages, plan_by_policy
 from jaxsand.planning.pipeline import Target, at_rest
 from jaxsand.planning.search import SandPlan, plan_sand
+from jaxsand.planning.search.actions import Lattice, Rising
 from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.progress import Tell
+from jaxsand.scene.scene import Scene, blade_of
+from jaxsand.scene.tools import Blade
+
+_WIDTHS = (0.5, 1.0, 2.0)  # of the blades to choose from, in those of the target's own
+_THICKNESS = 1.5  # spacings
 
 
 def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: int, seed: int, tell: Tell) -> Target:
     """The target with at most `strokes` strokes from a search on real sand, which costs at most `pushes` pushes (see
     `plan_sand`).
 
-    The distance counts all sand, berms too, even where the goal is nowhere above height 0.
+    For a glyph they are as deep as the blade; for other goals the tool rises and sinks on them, and is the best of three
+    blades. The distance counts all sand, berms too, unless the goal has weights.
     """
-    start = at_rest(target.scene, before, tell)
+    scene, start = target.scene, at_rest(target.scene, before, tell)
     tell(f"searching {strokes} strokes in {pushes} pushes")
-    found = plan_sand(target.scene, start, target.wanted, strokes=strokes, budget=pushes, seed=seed)
-    return _by("search", target, found, found.paths)
+    level = target.kind == "glyph"
+    found = plan_sand(
+        scene,
+        start,
+        target.wanted,
+        strokes=strokes,
+        actions=Lattice() if level else Rising(),
+        budget=pushes,
+        seed=seed,
+        tools=() if level else _blades(scene),
+    )
+    return _by("search", replace(target, scene=replace(scene, tool=found.tool or scene.tool)), found, found.paths)
+
+
+def _blades(scene: Scene) -> tuple[Blade, ...]:
+    """Blades half as wide as the scene's, as wide, and twice as wide, but none wider than the map's shorter side."""
+    blade, spacing = blade_of(scene), float(scene.grid.spacing)
+    most = max(float(blade.width), min(scene.grid.shape) * spacing)
+    widths = (times * float(blade.width) for times in _WIDTHS)
+    return tuple(Blade(width=width, thickness=_THICKNESS * spacing, depth=0.0) for width in widths if width <= most)
 
 
 def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxsand.goals import metrics
 from jaxsand.goals.goal import Goal, as_goal
+from jaxsand.goals.surfaces import rested
 from jaxsand.interaction.outcome import check
 from jaxsand.interaction.simulate import Shaped, follow_frames
 from jaxsand.interaction.stepped import SteppedPush
@@ -21,8 +22,7 @@ from jaxsand.planning.binary import Cell, connected_pieces, plan
 from jaxsand.planning.gradient import Optimised
 from jaxsand.planning.learned.stages import Planned
 from jaxsand.planning.search import SandPlan
-from jaxsand.relaxation.settling import settle, steepest_slope
-from jaxsand.relaxation.stopping import UntilStill
+from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
@@ -72,13 +72,16 @@ class Target:
       method: what planned the strokes.
       scene: grid, sand and tool.
       goal: [H, W] (m), row 0 at y = 0, NaN where it is free.
-      paths: points [n, 2] = x, y (m) of each path; the tool is lifted between paths.
+      paths: points [n, 2] = x, y (m) of each path, or [n, 3] with the heights of the tool's bottom; the tool is lifted
+        between paths.
       drawn: whether the goal was drawn without berms, so that only min(h, 0) is compared.
       depth: of a trench (m).
       optimal: whether the number of steps is proven to be the fewest; None where nothing was proven.
       lower_bound: no plan has fewer steps; None where nothing was proven.
       found: what a method that tries strokes on sand reported.
       weighted: the goal with its weights, if some cell that is not free costs more or less than another.
+      missed: how many of the goal's dug cells the blade does not pass over, by a plan over blocks of cells; nothing is
+        proven of such a plan.
     """
 
     name: str
@@ -93,6 +96,7 @@ class Target:
     lower_bound: float | None = None
     found: SandPlan | Optimised | Planned | None = None  # what a search on real sand says of itself
     weighted: Goal | None = None
+    missed: int = 0
 
     @property
     def wanted(self) -> Goal | np.ndarray:
@@ -137,12 +141,12 @@ class ShapeResult:
     @property
     def steps(self) -> int:
         """The number of legs that have a length above 0."""
-        return sum(int(np.any(np.diff(path, axis=0), axis=1).sum()) for path in self.target.paths)
+        return sum(int(np.any(np.diff(path[:, :2], axis=0), axis=1).sum()) for path in self.target.paths)
 
     @property
     def strokes(self) -> list[list[float]]:
-        """Every leg as x0, y0, x1, y1 (m), in order."""
-        return [[float(v) for v in (*a, *b)] for p in self.target.paths for a, b in pairwise(p)]
+        """Every leg as x0, y0, x1, y1 (m), in order, without its heights."""
+        return [[float(v) for v in (*a[:2], *b[:2])] for p in self.target.paths for a, b in pairwise(p)]
 
 
 def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -> Target:
@@ -174,7 +178,8 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
     depth.
 
     The map is divided into blocks of about `layout.cell` grid cells a side, none wider than the blade, and a block is dug
-    where its mean is deep enough.
+    where its mean is deep enough. What is dug in the goal but not in its block's mean is left out: `missed` says how many
+    cells are, and then nothing is proven.
 
     Raises:
       ValueError: for a goal that is not finite, smaller than a block, or nowhere deep enough.
@@ -203,7 +208,20 @@ def height_target(goal: np.ndarray, kind: Kind, name: str, layout: Layout) -> Ta
         path = np.stack([(columns + 0.5) * width, (counts[0] - rows - 0.5) * height], 1)
         paths.append(np.concatenate([path, path[-1:]]) if len(path) == 1 else path)
         optimal, lower = optimal and found.optimal, lower + found.lower_bound
+    missed = int((np.asarray(metrics.dug(target.goal, layout.depth)) & ~_passed_over(dig, target.goal.shape, layout)).sum())
+    if missed:
+        return replace(target, paths=tuple(paths), missed=missed)
     return replace(target, paths=tuple(paths), optimal=optimal, lower_bound=lower)
+
+
+def _passed_over(dig: np.ndarray, shape: tuple[int, ...], layout: Layout) -> np.ndarray:
+    """Which grid cells [H, W] have their centre under the blade where it digs the blocks `dig` (row 0 on top)."""
+    half = layout.oversize * layout.cell / 2 + 1e-9
+    under = [
+        np.abs((np.arange(cells) + 0.5)[:, None] - (np.arange(blocks) + 0.5) * cells / blocks) <= half
+        for cells, blocks in zip(shape, dig.shape, strict=True)
+    ]
+    return np.einsum("ib,bc,jc->ij", under[0], np.flipud(dig), under[1]) > 0
 
 
 def glyph_target(strokes: np.ndarray, name: str) -> Target:
@@ -216,7 +234,7 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
     beyond = max(0.0, placed[:, [0, 2]].max() - metrics.GLYPH_SQUARE[1])
     scene = make_scene((32, 32 + math.ceil(beyond / spacing - 1e-6)), spacing, tool=blade)
     paths = tuple(stroke.reshape(2, 2) for stroke in placed)
-    goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, _rounded(2))
+    goal, (program, _) = np.zeros(scene.grid.shape, np.float32), _program(scene, _rounded(2), 2)
     for path in paths:
         shaped, _ = program(jnp.asarray(goal), _padded(_divided(path, spacing), _rounded(2)))
         check(shaped)
@@ -224,14 +242,11 @@ def glyph_target(strokes: np.ndarray, name: str) -> Target:
     return Target(name, "glyph", "strokes", scene, goal, paths, False, float(blade.depth))
 
 
-def image_target(picture: np.ndarray, name: str, layout: Layout, cells: int) -> Target:
-    """A picture (0 to -1, row 0 at the bottom) as a height map of at most `cells` grid cells a side, and the margin around
-    it.
-    """
+def image_goal(picture: np.ndarray, layout: Layout, cells: int) -> np.ndarray:
+    """A picture (0 to -1, row 0 at the bottom) as a height map [H, W] (m), at most `cells` cells a side and a margin."""
     scale = cells / max(picture.shape)
     shape = [max(1, round(n * scale)) for n in picture.shape]
-    goal = np.pad(layout.depth * metrics.resample(picture, (shape[0], shape[1])), layout.margin)
-    return height_target(goal, "image", name, layout)
+    return np.pad(layout.depth * metrics.resample(picture, (shape[0], shape[1])), layout.margin)
 
 
 def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) -> ShapeResult:
@@ -256,7 +271,7 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) 
     every = math.ceil(sum(map(len, ways)) * start.nbytes / _KEPT) or 1
     for number, way in enumerate(ways, 1):
         tell(f"pushing path {number} of {len(ways)}" if number > 1 else "compiling")
-        program, compile_seconds = _program(scene, longest)
+        program, compile_seconds = _program(scene, longest, way.shape[1])
         began_to_run = time.perf_counter()
         shaped, on_the_way = program(jnp.asarray(height), _padded(way, longest))
         check(shaped)
@@ -276,9 +291,7 @@ def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
         return np.zeros(scene.grid.shape, np.float32)
     metrics.fits(scene, before, "surface")
     tell("settling the surface")
-    rested = settle(scene, np.asarray(before, np.float32), stop=UntilStill(bound=200_000))
-    check(rested)
-    return np.asarray(rested.height)
+    return rested(scene, np.asarray(before))
 
 
 def _figures(target: Target, before: np.ndarray, after: np.ndarray) -> dict[str, float]:
@@ -315,7 +328,7 @@ def _divided(path: np.ndarray, spacing: float) -> np.ndarray:
     All legs but the last are of whole sub-steps of the push, so that the path leaves what the stroke leaves, up to rounding.
     """
     run = path[-1] - path[0]
-    length = float(np.hypot(*run))
+    length = float(np.hypot(*run[:2]))
     if len(path) > 2 or not length:
         return path
     substep = SteppedPush().substep * spacing / length
@@ -325,15 +338,17 @@ def _divided(path: np.ndarray, spacing: float) -> np.ndarray:
 
 
 @cache
-def _program(scene: Scene, points: int) -> tuple[Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]], float]:
-    """`follow_frames` for paths of `points` points, compiled ahead, and the seconds that compiling took.
+def _program(
+    scene: Scene, points: int, columns: int
+) -> tuple[Callable[[jax.Array, jax.Array], tuple[Shaped, jax.Array]], float]:
+    """`follow_frames` for paths [points, columns], compiled ahead, and the seconds that compiling took.
 
     It works on the whole map: the heap of a path of many legs outgrows any window that fits the blade.
     """
     began = time.perf_counter()
     scene = replace(scene, window=Whole())
     height = jax.ShapeDtypeStruct(scene.grid.shape, np.float32)
-    path = jax.ShapeDtypeStruct((points, 2), np.float32)
+    path = jax.ShapeDtypeStruct((points, columns), np.float32)
     program: Callable[..., Any] = jax.jit(partial(follow_frames, scene)).lower(height, path).compile()
     return program, time.perf_counter() - began
 
@@ -348,7 +363,8 @@ def _moments(path: np.ndarray, recorded: np.ndarray, every: int) -> tuple[np.nda
     what was recorded of the padding behind the path.
     """
     after = np.unique(np.append(np.arange(every, len(path), every), len(path) - 1))
-    return recorded[after - 1], np.concatenate([path[after], _headings(np.diff(path, axis=0))[after - 1]], 1)
+    flat = path[:, :2]
+    return recorded[after - 1], np.concatenate([flat[after], _headings(np.diff(flat, axis=0))[after - 1]], 1)
 
 
 def _headings(runs: np.ndarray) -> np.ndarray:

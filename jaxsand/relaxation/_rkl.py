@@ -39,6 +39,7 @@ class RklStages:
         return replace(state, last=tuple(m * cut for m in state.last))
 
     def recorded(self, params: GroupParams, k: jax.Array, state: RklState) -> tuple[RklState, Tree]:
+        """The state after the stages, and for its derivative two bits for each link and stage, or else the state before."""
         bed, cells = params.bed, params.cells
         if not bed.by_links:
             return Plain(self).recorded(params, k, state)
@@ -59,6 +60,7 @@ class RklStages:
         return replace(state, last=tuple(m * cut for m in state.last)), codes
 
     def jvp(self, params: GroupParams, k: jax.Array, record: Tree, dparams: Tree, dstate: RklState) -> RklState:
+        """The jvp, from which links were active."""
         bed, cells = params.bed, params.cells
         if not bed.by_links:
             return Plain(self).jvp(params, k, record, dparams, dstate)
@@ -85,6 +87,7 @@ class RklStages:
         return RklState(halo(dh, 0.0), None, flux_adjoint.from_lattice(bed, last))
 
     def vjp(self, params: GroupParams, k: jax.Array, record: Tree, cotangent: RklState) -> tuple[Tree, RklState]:
+        """The vjp, from which links were active."""
         bed, cells = params.bed, params.cells
         if not bed.by_links:
             return Plain(self).vjp(params, k, record, cotangent)

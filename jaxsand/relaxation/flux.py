@@ -1,21 +1,6 @@
-"""The flux of sand over every link that is steeper than repose.
+"""The flux of sand over every link that is steeper than repose: gradient steps on a convex function of the heights.
 
-With heights h, spacing dx and mu = tan(angle of repose), a sweep is a gradient step on a convex function E of h. For 4 or 8
-neighbours, E is the sum over links, of length l dx, of excess^2 / (2 l), and cell i gains from cell j the flux
-
-    f_ij = excess(h_j - h_i, mu l dx) / l,       excess(s, m) = s - clip(s, -m, m)
-
-(Eq. 1-2 of arXiv:1908.02745). Repose then holds along four or eight directions; with eight, piles are octagons.
-
-Isotropic sand limits the length of the gradient. A cell has four one-sided gradients g, one for each pair of a straight
-neighbour along x and one along y. E is the sum of max(|g| - mu, 0)^2 / 8 over all of them, with heights in spacings, and
-only straight links carry sand:
-
-    f_ij = (h_j - h_i) * mean of max(1 - mu / |g|, 0) over the four gradients that contain the link.
-
-Its piles converge to cones as the grid is refined. A link to a missing neighbour (wall, edge) carries nothing. What follows
-from E: notebooks/site/theory/settling.md.
-
+The functions, for 4 and 8 neighbours and for isotropic sand, and what follows from them: notebooks/site/theory/settling.md.
 Fluxes are kept as one map for each direction of links, so that cell j loses the very number that cell i gains. Links to the
 edge count too: the maps are [H, W + 1] along x, [H + 1, W] along y, and [H + 1, W + 1] on diagonals.
 """
@@ -124,7 +109,9 @@ def received(neighbours: Neighbours, flow: Fluxes) -> Float[Array, "H W ..."]:
 
 
 def of_cells(neighbours: Neighbours, flow: Sequence[jax.Array]) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """For each direction, the fluxes [H, W] over the link whose first cell a cell is, and over that whose second it is."""
+    """Yields, for each direction, two maps [H, W]: the flux over the link in which the cell comes first, and over the one in
+    which it comes second.
+    """
     for (di, dj, _), f in zip(links(neighbours), flow, strict=False):
         rows, columns = f.shape[:2]
         first, second = f[:, max(dj, 0) : columns + min(dj, 0)], f[:, max(-dj, 0) : columns - max(dj, 0)]

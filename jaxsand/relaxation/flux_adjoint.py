@@ -1,15 +1,8 @@
 """The jvp and vjp of a sweep with 4 or 8 neighbours: links steeper than repose pass tangents on, other links do not.
 
-Such a sweep is piecewise linear. Let s be the surface, D s its steps over the links, G = -D^T what cells gain from fluxes, A
-the active links, which are steeper than the largest stable step m, sigma = +-1 the side to which they are, and c the rate
-over a link's length times its open share. The sweep is u' = u + G c A (D s - sigma m), so that with ds = S du
-
-    du'     = du + G c A (D ds - sigma dm)              is its jvp,
-    lambda  = lambda' + S^T G c A D lambda'             its vjp for u, and
-    mu      = sum of c A sigma D lambda'                its vjp for m.
-
-Links of all directions are kept on one lattice [H + 1, W + 1]. At its point (i, j) the cells (i, j) to (i + 1, j + 1) of a
-map with ghost cells meet. Two bits for each link say whether it is active, and to which side.
+Such a sweep is piecewise linear; its derivatives are written out in notebooks/site/theory/gradients.md ("A sweep"). Links of
+all directions are kept on one lattice [H + 1, W + 1]. At its point (i, j) the cells (i, j) to (i + 1, j + 1) of a map with
+ghost cells meet. Two bits for each link say whether it is active, and to which side.
 """
 
 from dataclasses import replace
@@ -18,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsand.relaxation.ghost_cells import Bed, halo
+from jaxsand.relaxation.ghost_cells import Bed, halo, total
 from jaxsand.scene.grid import links
 
 Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
@@ -121,11 +114,6 @@ def to_less_open(bed: Bed, gate: Ghosted, parts: list[OnLattice]) -> Ghosted:
         less = here <= there
         net = net + _corners(jnp.where(less, part, 0))[3 - first] + _corners(jnp.where(less, 0, part))[3 - second]
     return halo(jnp.asarray(net), 0.0)
-
-
-def total(x: Float[Array, "H W"]) -> Float[Array, ""]:
-    """The sum of a map; the rows come first because XLA vectorises that."""
-    return jnp.sum(jnp.sum(x, axis=0))
 
 
 def to_shape(cotangent: jax.Array, like: jax.Array) -> jax.Array:

@@ -129,6 +129,11 @@ def largest(height: Float[Array, "..."]) -> Float[Array, ""]:
     return jnp.max(jnp.max(jnp.where(size > 0, size, 0), axis=0))  # rows first: XLA vectorises that
 
 
+def total(x: Float[Array, "H W"]) -> Float[Array, ""]:
+    """The sum of a map; the rows come first because XLA vectorises that."""
+    return jnp.sum(jnp.sum(x, axis=0))
+
+
 def quantum(scale: Float[Array, ""]) -> Float[Array, ""]:
     """The least power of two of which heights up to `scale` hold at most 2^(p - 1), p the number of significand bits."""
     info = jnp.finfo(scale.dtype)

@@ -6,6 +6,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Neighbours = Literal[4, 8, "isotropic"]
@@ -52,3 +53,9 @@ def centres(grid: Grid, dtype: jax.typing.DTypeLike) -> tuple[Float[Array, "1 W"
     x = (jnp.arange(columns, dtype=dtype) + 0.5) * dx
     y = (jnp.arange(rows, dtype=dtype) + 0.5) * dx
     return x[None, :], y[:, None]
+
+
+def places(shape: tuple[int, int], spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the cells of a map lie: their x and their y, each [H, W] (m), in float64 on the host; see `centres`."""
+    x, y = np.meshgrid((np.arange(shape[1]) + 0.5) * spacing, (np.arange(shape[0]) + 0.5) * spacing)
+    return x, y

@@ -58,6 +58,7 @@ LETE_SAND = Soil(15.7e3, math.radians(31.1), 1.3e3, math.radians(31.1) * 2 / 3, 
 
 
 def check_soil(soil: Soil) -> None:
+    """Raises ValueError for a soil with a number out of range."""
     for name in (field.name for field in fields(soil)):
         low = TINY if name in ("exponent", "shear_displacement") else 0
         high = {"friction": 1.57, "interface_friction": 1.57, "exponent": 3}.get(name, np.inf)
@@ -65,6 +66,7 @@ def check_soil(soil: Soil) -> None:
 
 
 def check_number(name: str, value: Scalar, low: float, high: Scalar, remedy: str) -> None:
+    """Raises ValueError unless it is one finite number from `low` to `high`; what is being traced passes."""
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array) and low <= array <= high):
         least = "above" if low else "of at least"

@@ -20,16 +20,19 @@ def concrete(value: object) -> np.ndarray | None:
 
 
 def positive(name: str, value: object, remedy: str) -> None:
+    """Raises ValueError unless it is one finite number above 0; what is being traced passes."""
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array) and array > 0):
         raise ValueError(f"{name}: got {short(value)}; it must be one finite number above 0: {remedy}")
 
 
 def finite(name: str, value: object, remedy: str) -> None:
+    """Raises ValueError unless it is one finite number; what is being traced passes."""
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array)):
         raise ValueError(f"{name}: got {short(value)}; it must be one finite number: {remedy}")
 
 
 def short(value: Any) -> str:
+    """A value as messages show it: a number as it is, of an array its shape."""
     return repr(value) if np.ndim(value) == 0 else f"an array of shape {list(np.shape(value))}"

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.scene.boundaries import Walls
+from jaxsand.scene.boundaries import Base, Walls
 from jaxsand.scene.grid import Grid
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.window import Window
@@ -47,17 +47,23 @@ def isotropic(scene: Scene) -> Scene:
 
 
 def finer(scene: Scene, times: int) -> Scene:
-    """The scene on a grid `times` as fine; each new cell takes the angle of repose, and the wall, of the cell it lies in."""
+    """The scene on a grid `times` as fine.
+
+    Each new cell takes the angle of repose, and the wall, of the cell it lies in. A floor that is a map is interpolated, as
+    `resolve` does with sand.
+    """
     rows, columns = scene.grid.shape
     grid = Grid(scene.grid.spacing / times, (times * rows, times * columns), scene.grid.neighbours)
-    material, walls, window = scene.material, scene.walls, scene.window
+    material, walls, window, base = scene.material, scene.walls, scene.window, scene.base
     if np.ndim(material.repose_angle):
         material = replace(material, repose_angle=divide(material.repose_angle, times))
     if isinstance(walls, Walls):
         walls = Walls(divide(walls.solid, times))
+    if isinstance(base, Base) and np.ndim(base.height):
+        base = Base(_planes(scene, jnp.asarray(base.height), times))
     if isinstance(window, Window):
         window = Window((times * window.size[0], times * window.size[1]), window.tolerance * times)
-    return replace(scene, grid=grid, material=material, walls=walls, window=window)
+    return replace(scene, grid=grid, material=material, walls=walls, window=window, base=base)
 
 
 def divide(cells: jax.typing.ArrayLike, times: int) -> jax.Array:
@@ -70,15 +76,29 @@ def resolve(scene: Scene, height: jax.Array, times: int) -> jax.Array:
 
     Within a cell the map is a plane through its mean. Its slope along x and along y is the smaller of the differences to the
     two neighbours, or 0 where these differ in sign (van Leer 1979, doi:10.1016/0021-9991(79)90145-1, with the minmod
-    limiter). So steps stay sharp, and a flank at repose does not become a staircase. Cells next to solid cells or to the
-    edge are level.
+    limiter). So steps stay sharp, and a flank at repose does not become a staircase. A slope is 0 too along an axis on which
+    the cell has a solid neighbour, or the map's edge beside it.
+
+    On a floor (`Base`), where that plane would cut the floor of `finer`, the thickness of the sand is a plane instead, and
+    nowhere below 0.
     """
-    rows, columns = height.shape
-    sand = jnp.where(scene.walls.solid, jnp.nan, height) if isinstance(scene.walls, Walls) else height
-    off = jnp.asarray((np.arange(times) + 0.5) / times - 0.5, height.dtype)
-    along_y = divide(_slope(sand, 0), times) * jnp.tile(off, rows)[:, None]
-    along_x = divide(_slope(sand, 1), times) * jnp.tile(off, columns)[None, :]
-    return divide(height, times) + along_y + along_x
+    fine = _planes(scene, height, times)
+    if not isinstance(scene.base, Base):
+        return fine
+    floor = jnp.broadcast_to(jnp.asarray(scene.base.height, height.dtype), height.shape)
+    fine_floor = _planes(scene, floor, times)
+    on_floor = fine_floor + _planes(scene, height - floor, times)
+    return jnp.where(divide(means((fine < fine_floor).astype(height.dtype), height.shape) > 0, times), on_floor, fine)
+
+
+def _planes(scene: Scene, cells: jax.Array, times: int) -> jax.Array:
+    """A map [H, W] as a plane in each cell, at the cells [times H, times W] of a grid `times` as fine."""
+    rows, columns = cells.shape
+    known = jnp.where(scene.walls.solid, jnp.nan, cells) if isinstance(scene.walls, Walls) else cells
+    off = jnp.asarray((np.arange(times) + 0.5) / times - 0.5, cells.dtype)
+    along_y = divide(_slope(known, 0), times) * jnp.tile(off, rows)[:, None]
+    along_x = divide(_slope(known, 1), times) * jnp.tile(off, columns)[None, :]
+    return divide(cells, times) + along_y + along_x
 
 
 def _slope(height: jax.Array, axis: int) -> jax.Array:

@@ -1,20 +1,8 @@
 """The trench of a towed wheel in closed form, and its exact relaxation.
 
-Pavlov & Johnson, Soil Displacement Terramechanics for Wheel-Based Trenching with a Planetary Rover (ICRA 2019). A wheel of
-radius r and width b is dragged at sinkage h, with the slip angle beta between its plane and its direction of travel. Let
-t = tan(angle of repose), s = sqrt(2 r h - h^2) half the wheel's chord in the sand, and p = b cos(beta). The wheel sweeps a
-cut w = p + 2 s sin(beta) wide: a floor of width p at depth h between two flanks, each (w - p) / 2 wide, a parabola, and of
-area A = (w - p) h / 3.
-
-Before the sand flows, the sand from the cut stands beside it in two right triangles, steep against the cut. They are equal,
-unless the flanks hold more than the floor (2 A > h p) and beta is at least 10 degrees from 0 and from 90: then the left one
-holds 2 A and the right one h p. Where beta passes these 10 degrees the piles jump; where 2 A passes h p the two rules agree.
-After the sand has flowed, all faces lie at repose and the outer toes stay where they were. The sand of the left and of the
-right pile meets at the end of the floor, x = p / 2; for beta below 10 degrees it meets in the middle, so that pointed
-profiles jump there.
-
-Heights and places are in metres, x to the right across the direction of travel, 0 at the middle of the cut; angles are in
-radians.
+Pavlov & Johnson, Soil Displacement Terramechanics for Wheel-Based Trenching with a Planetary Rover (ICRA 2019). The form:
+notebooks/site/theory/closed-forms.md ("A wheel's trench"). Heights and places are in metres, x to the right across the
+direction of travel, 0 at the middle of the cut; angles are in radians.
 """
 
 import math

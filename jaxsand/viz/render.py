@@ -219,7 +219,7 @@ def _map(axes: "Axes", values: np.ndarray, target: Target, title: str, colours: 
 def _path(axes: "Axes", result: ShapeResult) -> None:
     """Draws the tool's paths with arrows."""
     size = 6 if len(result.target.paths) < 10 else 3
-    for number, path in enumerate(result.target.paths):
+    for number, path in enumerate(path[:, :2] for path in result.target.paths):
         axes.plot(*path.T, "-", color="black", lw=1.2, alpha=0.7)
         axes.plot(*path[0], "o", color="black", ms=size, label="lowered" if not number else None)
         axes.plot(*path[-1], "s", color="black", ms=size, mfc="none", label="lifted" if not number else None)

@@ -1,10 +1,12 @@
 """The sand from the side: profiles along a tool's path and across it, with the tool's outline where it stands."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from jaxsand.scene.scene import Scene
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Maps = Mapping[str, ArrayLike]
 _BEYOND = 6  # spacings that are drawn on both sides of a path
 _LOOKS: tuple[dict[str, Any], ...] = (
     {"color": "0.55", "ls": "--", "lw": 1.2},
@@ -22,7 +25,7 @@ _LOOKS: tuple[dict[str, Any], ...] = (
 )
 
 
-def side_figure(scene: Scene, maps: dict[str, np.ndarray], path: np.ndarray, title: str = "") -> "Figure":
+def side_figure(scene: Scene, maps: Maps, path: ArrayLike, title: str = "") -> "Figure":
     """The sand along a path of the tool, and across its middle, each with the tool's outline.
 
     Args:
@@ -66,11 +69,11 @@ class Side:
 
     title: str
     scene: Scene
-    maps: dict[str, np.ndarray]
-    path: np.ndarray
+    maps: Maps
+    path: ArrayLike
 
 
-def sides_figure(shown: list[Side]) -> "Figure":
+def sides_figure(shown: Sequence[Side]) -> "Figure":
     """As `side_figure`, a line for each of several."""
     from matplotlib.figure import Figure
 
@@ -85,12 +88,13 @@ def sides_figure(shown: list[Side]) -> "Figure":
     return figure
 
 
-def draw_along(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: np.ndarray) -> None:
+def draw_along(axes: "Axes", scene: Scene, maps: Maps, path: ArrayLike) -> None:
     """Draws maps [H, W] (m) in mm over the distance (m) along a path [n, 2] or [n, 3] (m), with the tool at both ends.
 
     The sand is drawn a little beyond the ends too.
     """
     spacing = float(scene.grid.spacing)
+    path = _checked(path)
     far, points = _walked(path, spacing / 2)
     beyond = np.arange(1, 2 * _BEYOND) * spacing / 2
     before, after = (points[a] + beyond[:, None] * _ahead(points[a] - points[b]) for a, b in ((0, 1), (-1, -2)))
@@ -105,12 +109,20 @@ def draw_along(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: np
     axes.set(xlabel="along the path (m)")
 
 
-def draw_across(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], path: np.ndarray, share: float = 0.5) -> None:
-    """Draws maps [H, W] (m) in mm across a path [n, 2] or [n, 3] (m), at a share of its length, with the tool there.
+def draw_across(axes: "Axes", scene: Scene, maps: Maps, path: ArrayLike, share: float = 0.5) -> None:
+    """Draws the sand on a straight section across a path [n, 2] or [n, 3] (m), at a share of its length, and the tool there.
 
-    The distance to the left of the path (m) runs as far as the tool is wide on both sides.
+    Args:
+      axes: what is drawn on: heights in mm over the distance to the left of the path (m).
+      scene: grid and tool.
+      maps: height maps [H, W] (m) by name.
+      path: the points of the tool, as of `side_figure`.
+      share: how far along the path the section lies, 0 at its start, 1 at its end.
+
+    The section is as long on each side as the tool is wide, and 8 spacings at least.
     """
     spacing = float(scene.grid.spacing)
+    path = _checked(path)
     far, points = _walked(path, spacing / 2)
     at = min(round(share * (len(far) - 1)), len(far) - 2)
     ahead = _ahead(points[at + 1] - points[at])
@@ -181,7 +193,7 @@ def _box(start: float, stop: float, tall: float) -> np.ndarray:
     return np.array([[start, 0.0], [stop, 0.0], [stop, tall], [start, tall]])
 
 
-def _profiles(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], far: np.ndarray, points: np.ndarray) -> None:
+def _profiles(axes: "Axes", scene: Scene, maps: Maps, far: np.ndarray, points: np.ndarray) -> None:
     for k, (name, height) in enumerate(maps.items()):
         if np.shape(height) != scene.grid.shape:
             remedy = f"give a map of shape {list(scene.grid.shape)}"
@@ -191,7 +203,7 @@ def _profiles(axes: "Axes", scene: Scene, maps: dict[str, np.ndarray], far: np.n
     axes.margins(x=0.02)
 
 
-def _walked(path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+def _walked(path: ArrayLike, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Distances [k] (m) along a path, at its corners and about `step` apart, and the points [k, 2] (m) there."""
     path = _checked(path)
     legs = np.hypot(*np.diff(path[:, :2], axis=0).T)
@@ -200,7 +212,7 @@ def _walked(path: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     return far, np.stack([np.interp(far, at, path[:, k]) for k in (0, 1)], axis=1)
 
 
-def _bottom(tool: Tool, path: np.ndarray, far: np.ndarray) -> np.ndarray:
+def _bottom(tool: Tool, path: ArrayLike, far: np.ndarray) -> np.ndarray:
     """Heights [k] (m) of the tool's lowest point at distances [k] (m) along a path."""
     path = _checked(path)
     if isinstance(tool, Wheel) and tool.load is not None:
@@ -213,15 +225,15 @@ def _bottom(tool: Tool, path: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def _ahead(run: np.ndarray) -> np.ndarray:
-    """A vector [2] at length 1; of none, along x."""
+    """The direction [2] of a step `run` [2], as a vector of length 1; along x where the step is none."""
     length = np.hypot(*run)
     return run / length if length > 0 else np.array([1.0, 0.0])
 
 
-def _checked(path: np.ndarray) -> np.ndarray:
-    path = np.asarray(path, float)
-    if not np.isfinite(path).all():
+def _checked(path: ArrayLike) -> np.ndarray:
+    points = np.asarray(path, float)
+    if not np.isfinite(points).all():
         raise ValueError("path: got a number that is not finite; give every point in metres")
-    if path.ndim != 2 or len(path) < 2 or path.shape[1] not in (2, 3) or not np.ptp(path[:, :2], axis=0).any():
-        raise ValueError(f"path: got shape {list(path.shape)}; give two points or more, [n, 2] or [n, 3], that lie apart")
-    return path
+    if points.ndim != 2 or len(points) < 2 or points.shape[1] not in (2, 3) or not np.ptp(points[:, :2], axis=0).any():
+        raise ValueError(f"path: got shape {list(points.shape)}; give two points or more, [n, 2] or [n, 3], that lie apart")
+    return points

@@ -31,7 +31,16 @@ def test_doing_nothing_is_told_as_that(monkeypatch):
     means = [figures(make_task("ring", key), make_task("ring", key).start)["mean_mm"] for key in (0, 1)]
     assert row["mean_mm"] == row["before_mm"] == pytest.approx(np.mean(means))
     assert row["worst_mm"] == pytest.approx(max(means))
+    assert row["distance_at_best"] < 1e-9
+    assert row["at_best_mm"] < 1e-3
     assert (row["strokes"], row["path_m"], row["moved"], row["coverage"]) == (0, 0, 0, None)
+
+
+def test_of_vertical_walls_the_floor_is_told(monkeypatch):
+    monkeypatch.setitem(tasks.RIVALS, "random", lambda *_: ((np.zeros((0, 6)), 0.0), tasks.Effort()))
+    (row,) = bench_tasks(names=("vertical",), methods=("random",), seed=1)  # 12 mm deep, walls of one cell
+    assert 0.2 * row["distance"] < row["distance_at_best"] < 0.3 * row["distance"]
+    assert row["at_best_mm"] == pytest.approx(1.65, rel=0.02)
 
 
 def test_names_that_do_not_exist_are_refused():

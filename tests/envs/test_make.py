@@ -82,17 +82,26 @@ def test_only_what_is_dug_counts_for_drawn_goals():
         (lambda: js.make("sand"), "^name: got 'sand'; give single-stroke, multi-stroke or excavate"),
         (lambda: js.make("multi-stroke", wind=1, goals=np.zeros((1, 32, 32))), "^wind: no option of multi-stroke"),
         (lambda: js.make("single-stroke", wind=1), "^wind: no option of single-stroke"),
+        (
+            lambda: js.make("multi-stroke", gols=1),
+            "^gols: no option of multi-stroke; give some of goals, starts, seed, scene, limit, zones, batching, heights, "
+            "measure, push, settle, stop, or see",
+        ),
+        (
+            lambda: js.make("single-stroke", gols=1),
+            "^gols: no option of single-stroke; give some of on, scene, goals, step_cost, limit, or see",
+        ),
         (lambda: js.make("single-stroke", scene=SMALL), "^scene: has no effect on a binary map"),
         (lambda: js.make("single-stroke", on=envs.OnSand(), scene=SMALL), r"^scene: got \[16, 16\] cells.*\[62, 62\]"),
         (lambda: small(goals=np.zeros((2, 5, 5))), r"^goals: got shape \[5, 5\], the scene has \[16, 16\]"),
-        (lambda: small(goals=np.zeros((16, 16))), r"^goals: got shape \[16, 16\]; give one or more maps"),
+        (lambda: small(goals=np.zeros(16)), r"^goals: got shape \[16\]; give a map \[H, W\], or maps \[G, H, W\]"),
         (lambda: small(goals=[np.zeros((16, 16))]), "^goals: got list; give RandomStrokes"),
         (lambda: small(starts="rough"), "^starts: got 'rough'; give Level"),
         (lambda: small(goals={"x": []}), "^goals: .x. has no list of strokes"),
         (lambda: small(goals={"x": [[0, 0, 1, 1], [0]]}), "^goals: .x. has no list of strokes; give numbers"),
         (lambda: small(goals={"x": [[0, 0, 1, 1j]]}), "^goals: .x. has no list of strokes"),
         (lambda: small(goals={"x": [[0, 0, 1, np.inf]]}), "^goals: .x. has .* as stroke 1; give finite numbers"),
-        (lambda: small(goals=np.array([[["a"]]])), "^goals: got <U1; give one or more maps"),
+        (lambda: small(goals=np.array([[["a"]]])), "^goals: got <U1; give a map"),
         (
             lambda: small(goals=envs.LevelGoals(jnp.zeros((1, 5, 5)))),
             r"^goals: got maps of \[5, 5\], the scene has \[16, 16\]",

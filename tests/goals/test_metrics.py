@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsand.bench.stroke_goals import letters
-from jaxsand.goals.layout import right, strict, strokes_right
+from jaxsand.goals.success import right, strict, strokes_right
 from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.tools import Blade
 

@@ -7,7 +7,7 @@ import pytest
 
 import jaxsand as js
 
-from ..conftest import ANGLE, MU
+from ..conftest import ANGLE, MU, rough
 
 DX = 0.01
 N = 20
@@ -16,11 +16,6 @@ LEVEL = np.zeros((N, N))
 
 def on(base, tool, neighbours=8, **options):
     return js.make_scene((N, N), DX, ANGLE, neighbours, base=js.Base(base), tool=tool, **options)
-
-
-def rough(seed, span):
-    walk = np.cumsum(np.cumsum(np.random.default_rng(seed).normal(size=(N, N)), 0), 1)
-    return span * (walk - walk.min()) / np.ptp(walk)
 
 
 @pytest.mark.wide

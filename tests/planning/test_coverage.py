@@ -8,7 +8,7 @@ from jaxsand.bench.rivals import earth
 from jaxsand.goals.goal import as_goal
 from jaxsand.planning.search.actions import Job
 from jaxsand.planning.search.coverage import READINGS, coverage
-from jaxsand.planning.search.heights import best_coverage, least_work
+from jaxsand.planning.search.drafts import best_coverage, least_work
 from jaxsand.planning.search.rollouts import distance, replay
 from jaxsand.planning.search.transport import flows, heaviest
 

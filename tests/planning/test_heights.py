@@ -10,7 +10,8 @@ from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.goals.metrics import fits_where_it_counts
 from jaxsand.planning.search import rollouts
 from jaxsand.planning.search.actions import Job
-from jaxsand.planning.search.heights import around, propose_heights, search_heights, within
+from jaxsand.planning.search.heights import search_heights
+from jaxsand.planning.search.proposals import around, propose_heights, within
 from jaxsand.planning.search.reach import volume_distance
 from jaxsand.planning.search.rollouts import distance, replay
 from jaxsand.planning.stroke_loss import sand_loss
@@ -184,3 +185,16 @@ def test_plans_stay_on_the_map_and_heights_stay_as_they_are():
 def test_bad_input(actions, message):
     with pytest.raises(ValueError, match=message):
         js.plan_sand(SCENE, LEVEL, RAMP, actions=actions)
+
+
+def test_of_several_blades_the_one_that_suits_is_chosen():
+    """A wide one levels a ramp that a narrow one only scratches; what is tried counts, and the plan is that blade's."""
+    narrow, wide = js.Blade(width=0.02, thickness=0.03, depth=0.0), SCENE.tool
+    found = js.plan_sand(SCENE, LEVEL, RAMP, strokes=2, actions=js.Rising(), budget=40, tools=(narrow, wide))
+    assert found.tool == wide
+    assert found.effort.cost <= 40
+    np.testing.assert_array_equal(replay(SCENE, LEVEL, found.paths), found.height)
+    with pytest.raises(ValueError, match=r"tools: got a choice with Lattice\(\)"):
+        js.plan_sand(SCENE, LEVEL, RAMP, tools=(narrow, wide))
+    with pytest.raises(ValueError, match="tools: got Wheel; give blades"):
+        js.plan_sand(SCENE, LEVEL, RAMP, actions=js.Rising(), tools=(js.Wheel(),))

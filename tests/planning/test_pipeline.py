@@ -71,7 +71,8 @@ def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
     picture = np.zeros((20, 40))
     picture[4:16, 4:10] = -1
     picture[4:16, 28:34] = -1
-    result = shape(pipeline.image_target(picture, "two", pipeline.Layout(margin=6), 48))
+    layout = pipeline.Layout(margin=6)
+    result = shape(pipeline.height_target(pipeline.image_goal(picture, layout, 48), "image", "two", layout))
     assert result.lifted
     assert len(result.target.paths) == 2
     assert result.figures["iou"] > 0.5
@@ -116,7 +117,8 @@ def test_what_is_left_over_of_blocks_is_planned_too():
     layout = pipeline.Layout(depth=0.0075)
     found = pipeline.height_target(goal, "heights", "two", layout)
     assert len(found.paths) == 2
-    assert found.optimal
+    assert found.missed == 40  # the trench's first row lies in a block of which it is a sixth
+    assert found.optimal is found.lower_bound is None
     for path, (low, high) in zip(sorted(found.paths, key=lambda p: p[0, 1]), ((0.10, 0.16), (0.48, 0.53)), strict=True):
         assert np.all((path[:, 1] > low) & (path[:, 1] < high))
     for side in range(6, 40):  # no path misses what lies at an edge, and the blade covers every block
@@ -126,6 +128,22 @@ def test_what_is_left_over_of_blocks_is_planned_too():
         reach = layout.oversize * layout.cell * layout.spacing / 2
         assert path[:, 1].max() + reach >= side * layout.spacing - 1e-9
         assert path[:, 1].max() < side * layout.spacing
+
+
+def test_what_is_left_out_of_a_goal_is_counted_and_nothing_proven():
+    """A trench half in each of two rows of blocks, and one of two cells, beside one that fills its blocks."""
+    layout = pipeline.Layout(depth=0.0075)
+    goal = np.zeros((48, 48))
+    goal[6:12, 6:30] = -0.0075
+    whole = pipeline.height_target(goal, "heights", "whole", layout)
+    assert (whole.missed, whole.optimal, whole.lower_bound) == (0, True, 3)
+    for second in (slice(27, 33), slice(26, 28)):
+        more = goal.copy()
+        more[second, 6:30] = -0.0075
+        found = pipeline.height_target(more, "heights", "more", layout)
+        passed = (second.stop - second.start) * 24
+        assert (found.missed, found.optimal, found.lower_bound) == (passed, None, None)
+        assert np.array_equal(found.paths[0], whole.paths[0])
 
 
 def test_blocks_of_whole_cells_lie_as_ever():
@@ -146,7 +164,7 @@ def test_a_recording_takes_no_more_memory_than_its_frames(monkeypatch):
 
     monkeypatch.setattr(pipeline, "check", lambda _: None)  # what stands in for a push is no result
 
-    def program(scene, points):
+    def program(scene, points, _):
         def run(height, path):
             frames = np.zeros((points - 1, *height.shape), np.float32)
             return SimpleNamespace(height=np.asarray(height) + 1, outcome=np.zeros((), int)), frames
@@ -171,8 +189,8 @@ def test_one_push_gives_a_strokes_result_and_its_recording(monkeypatch):
     target = pipeline.Target("one", "glyph", "strokes", GLYPHS, level, (np.reshape(stroke, (2, 2)),), False, 0.0075)
     usual, pushes = pipeline._program, []
 
-    def program(scene, points):
-        run, seconds = usual(scene, points)
+    def program(scene, points, columns):
+        run, seconds = usual(scene, points, columns)
         return lambda height, path: pushes.append(path) or run(height, path), seconds
 
     monkeypatch.setattr(pipeline, "_program", program)

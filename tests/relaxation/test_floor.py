@@ -7,18 +7,12 @@ import pytest
 
 import jaxsand as js
 
-from ..conftest import ANGLE, MU
+from ..conftest import ANGLE, MU, rough
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 
 DX = 0.01
 N = 20
-
-
-def rough(seed, span):
-    """A smooth random surface [N, N] from 0 to `span` (m)."""
-    walk = np.cumsum(np.cumsum(np.random.default_rng(seed).normal(size=(N, N)), 0), 1)
-    return span * (walk - walk.min()) / np.ptp(walk)
 
 
 ROCK = rough(1, 0.25)

@@ -45,7 +45,10 @@ OF_MASKED = {
         r"start: got 1 masked cells; give \(row, column\)",
     ),
     "map_pool": (lambda: map_pool([np.ma.masked_array([[True, True]], [[False, True]])]), f"maps: {OF_DIG}"),
-    "goals": (lambda: js.make("multi-stroke", goals=MASKED[None]), "goals: got 1 cells that are not finite; fill them"),
+    "starts": (
+        lambda: js.make("multi-stroke", goals=LEVEL, starts=MASKED, scene=BLADED),
+        "starts: got 1 cells that are not finite; fill them",
+    ),
     "start": (lambda: js.optimise_strokes(BLADED, LEVEL, start=MASKED), "start: got 1 masked cells"),
     "before": (lambda: js.calibrate(BLADED, js.Trial(MASKED, LEVEL)), "before: got 1 masked cells"),
     "regions": (

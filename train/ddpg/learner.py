@@ -111,15 +111,18 @@ class Ddpg:
 
     @property
     def name(self) -> str:
+        """The learner's name, in files of runs."""
         return "ddpg"
 
     @property
     def actor(self) -> Actor:
+        """The network that chooses actions."""
         env, params = self.world()
         return Actor(self.sight.module(), env.action_space(params).shape[0])
 
     @property
     def critic(self) -> Critic:
+        """The network that values actions."""
         return Critic(self.sight.module())
 
     def world(self) -> tuple[Any, Any]:
@@ -127,6 +130,7 @@ class Ddpg:
         return self.task.world()
 
     def init(self, seed: int) -> Practice:
+        """The state before the first chunk."""
         return begin(self, self.world()[1], jax.random.key(seed))
 
     def advance(self, state: Practice) -> tuple[Practice, dict[str, float]]:

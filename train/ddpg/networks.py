@@ -52,6 +52,7 @@ class Flat:
     widths: tuple[int, ...] = (64, 64)
 
     def module(self) -> nn.Module:
+        """The layers."""
         return _Flat(self.widths)
 
 
@@ -66,6 +67,7 @@ class Maps:
     widths: tuple[int, ...] = (256, 128)
 
     def module(self) -> nn.Module:
+        """The layers."""
         return _Maps(self.channels, self.widths)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxsand.envs.library import RandomStrokes
 from jaxsand.envs.multi import LevelGoals, MultiStroke, StrokeParams
 from jaxsand.goals import metrics
-from jaxsand.goals.layout import right
+from jaxsand.goals.success import right
 from jaxsand.goals.usual import usual_scene
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.stroke_loss import pushed
@@ -40,15 +40,14 @@ class Strokes:
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The reward for any goal, from maps [H, W] in units of the blade's depth, and False: no goal ends an episode."""
-        reward = jnp.sqrt(jnp.sum((goal - before) ** 2)) - jnp.sqrt(jnp.sum((goal - after) ** 2))
-        return reward, jnp.zeros((), bool)
+        return metrics.l2(goal, before) - metrics.l2(goal, after), jnp.zeros((), bool)
 
     def most(self, observation: dict[str, jax.Array]) -> jax.Array:
         """An upper bound [B] of every value: with rewards L_t - L_{t+1}, L >= 0 and a discount g <= 1,
 
         sum_t g^t (L_t - L_{t+1}) = L_0 - (1 - g) sum_t g^t L_{t+1} <= L_0.
         """
-        return jnp.sqrt(jnp.sum((observation["goal"] - observation["current"]) ** 2, (1, 2)))
+        return metrics.l2(observation["goal"], observation["current"])
 
     def validate(self, acts: Acts) -> dict[str, float]:
         """Judges a policy on goals set apart.
@@ -60,7 +59,7 @@ class Strokes:
         goal, depth = np.asarray(params.goals.goals), float(Blade().depth)
         _, maps = one_after_the_other(acts, params.scene, np.zeros_like(goal), goal, self.count)
         after = np.nan_to_num(maps[-1])
-        far, left = (np.sqrt(((goal - x) ** 2).sum((1, 2))) for x in (maps[0], after))
+        far, left = (np.asarray(metrics.l2(goal, x)) for x in (maps[0], after))
         good = [right(g, x, depth) for g, x in zip(goal, after, strict=True)]
         return {"score": float(np.mean(1 - left / far)), "right": float(np.mean(good))}
 
@@ -72,6 +71,7 @@ class Probing:
     probe: Probe
 
     def world(self) -> tuple[Probe, None]:
+        """The environment and its parameters, of which it has none."""
         return self.probe, None
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:

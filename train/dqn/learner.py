@@ -92,13 +92,16 @@ class Dqn:
 
     @property
     def name(self) -> str:
+        """The learner's name, in files of runs."""
         return "dqn"
 
     @property
     def net(self) -> QNet:
+        """The network that values actions."""
         return QNet(self.task.look, self.task.actions, self.head, self.width, self.blocks)
 
     def init(self, seed: int) -> Walking:
+        """The state before the first chunk."""
         return begin(self, jax.random.key(seed))
 
     def advance(self, state: Walking) -> tuple[Walking, dict[str, float]]:

@@ -40,10 +40,12 @@ class SingleStroke:
 
     @property
     def actions(self) -> int:
+        """How many actions there are."""
         return 4
 
     @property
     def look(self) -> Look:
+        """How the network sees an observation."""
         return around
 
     def world(self, key: jax.Array) -> MapParams:
@@ -103,14 +105,17 @@ class Asking:
 
     @property
     def env(self) -> Probe:
+        """The environment."""
         return self.probe
 
     @property
     def actions(self) -> int:
+        """How many actions there are."""
         return Two.space.n
 
     @property
     def look(self) -> Look:
+        """How the network sees an observation."""
         return flat
 
     def world(self, key: jax.Array) -> None:

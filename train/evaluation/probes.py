@@ -21,9 +21,11 @@ class Two:
     space = Discrete(2)
 
     def reward(self, action: jax.Array, wanted: jax.Array) -> jax.Array:
+        """The reward of an action."""
         return (2.0 * action - 1) * wanted
 
     def best(self, wanted: jax.Array) -> jax.Array:
+        """The action of the largest reward."""
         return jnp.int32(wanted > 0)
 
 
@@ -34,9 +36,11 @@ class Line:
     space = Box(-1.0, 1.0, (1,))
 
     def reward(self, action: jax.Array, wanted: jax.Array) -> jax.Array:
+        """The reward of an action."""
         return 1 - (action[0] - wanted / 2) ** 2
 
     def best(self, wanted: jax.Array) -> jax.Array:
+        """The action of the largest reward."""
         return wanted[None] / 2
 
 
@@ -59,6 +63,7 @@ class Constant:
     steps, shows = 1, False
 
     def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        """The reward of an action in a state."""
         return jnp.float32(1)
 
 
@@ -69,6 +74,7 @@ class ByObservation:
     steps, shows = 1, True
 
     def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        """The reward of an action in a state."""
         return state.sign
 
 
@@ -79,6 +85,7 @@ class Late:
     steps, shows = 2, False
 
     def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        """The reward of an action in a state."""
         return state.time.astype(jnp.float32)
 
 
@@ -89,6 +96,7 @@ class ByAction:
     steps, shows = 1, False
 
     def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        """The reward of an action in a state."""
         return actions.reward(action, jnp.float32(1))
 
 
@@ -99,6 +107,7 @@ class ByBoth:
     steps, shows = 1, True
 
     def reward(self, actions: Actions, state: ProbeState, action: jax.Array) -> jax.Array:
+        """The reward of an action in a state."""
         return actions.reward(action, state.sign)
 
 
@@ -118,11 +127,13 @@ class Probe:
     actions: Actions
 
     def reset(self, key: jax.Array, params: None) -> tuple[jax.Array, ProbeState]:
+        """Begins an episode; returns its first observation and its state."""
         sign = jax.random.rademacher(key, (), jnp.float32) if self.question.shows else jnp.float32(0)
         state = ProbeState(sign, jnp.int32(0))
         return self.observe(state), state
 
     def step_env(self, key: jax.Array, state: ProbeState, action: Action, params: None) -> Step[jax.Array, ProbeState]:
+        """Takes one action, and does not begin a new episode after the last."""
         reward = self.question.reward(self.actions, state, jnp.asarray(action))
         new = ProbeState(state.sign, state.time + 1)
         return self.observe(new), new, reward, new.time >= self.question.steps, jnp.zeros((), bool), {}
@@ -130,12 +141,15 @@ class Probe:
     step = episode.step
 
     def observe(self, state: ProbeState) -> jax.Array:
+        """The observation of a state."""
         return jnp.stack([state.sign, state.time.astype(jnp.float32)])
 
     def action_space(self, params: None) -> Discrete | Box:
+        """The space of actions."""
         return self.actions.space
 
     def observation_space(self, params: None) -> Box:
+        """The space of observations."""
         return Box(-1.0, float(self.question.steps), (2,))
 
     def states(self) -> list[ProbeState]:

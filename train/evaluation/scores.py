@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsand.bench.stroke_goals import StrokeGoal
 from jaxsand.goals import metrics
-from jaxsand.goals.layout import right, strict, strokes_right
+from jaxsand.goals.success import right, strict, strokes_right
 from jaxsand.planning.learned.beam_search import Proposes
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.scene.progress import Tell, quiet
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = quiet) -> dict[str, Any]:
-    """Lets a policy push as often as each glyph has strokes, and judges the result (see `jaxsand.goals.layout`).
+    """Lets a policy push as often as each glyph has strokes, and judges the result (see `jaxsand.goals.success`).
 
     Returns:
       How many glyphs are `right` and `strict`, how many there are (`total`), how many have at least one right stroke

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsand.goals.layout import right, strokes_right
 from jaxsand.goals.metrics import iou
+from jaxsand.goals.success import right, strokes_right
 from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.learned.network import Params, StrokeNet, ends, judge, likeliest, spread
@@ -79,13 +79,16 @@ class Hindsight:
 
     @property
     def name(self) -> str:
+        """The learner's name, in files of runs."""
         return "hindsight"
 
     @property
     def net(self) -> StrokeNet:
+        """The network that proposes strokes."""
         return StrokeNet(self.widths, self.blocks)
 
     def init(self, seed: int) -> Progress:
+        """The state before the first chunk."""
         maps = jnp.zeros((1, SHAPE[0], SHAPE[0]))
         params = jax.jit(self.net.init)(jax.random.key(seed), maps, maps, jnp.zeros((1, 1, 4)))
         return Progress(params, params, _optimiser().init(params), jnp.int32(0), jnp.int32(seed))

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any, BinaryIO, Literal, Protocol
 
 from jaxsand.cli.files import as_json, folder, progress, write_json
+from jaxsand.scene.progress import Tell
 from train.runs.checkpoints import At, State, described, restored, save, unwritable, where
 from train.runs.checkpoints import load as load_state
 
@@ -83,7 +84,7 @@ def run(
     steps: int | None = None,
     resume: bool = False,
     save_every: float = 30.0,
-    tell: Callable[[str], None] | None = None,
+    tell: Tell | None = None,
     watch: Watch = lambda _: None,
 ) -> Ran:
     """Trains until `minutes` of work or `steps` chunks are done, those before a resumption included.

@@ -7,7 +7,8 @@ leave, and the pushes it tried.
 import numpy as np
 
 from jaxsand.planning.search.actions import Job
-from jaxsand.planning.search.heights import Ended, best_coverage, least_work, propose_heights
+from jaxsand.planning.search.drafts import Ended, best_coverage, least_work
+from jaxsand.planning.search.proposals import propose_heights
 from jaxsand.planning.search.rollouts import Effort, distance, pushed
 
 Found = tuple[Ended, Effort]

@@ -141,6 +141,7 @@ class GraphBlock:
 
     @property
     def bridge(self) -> bool:
+        """Whether the block is two cells and the edge between them."""
         return len(self.edges) == 1
 
 

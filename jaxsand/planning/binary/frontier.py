@@ -44,10 +44,12 @@ class Layered:
 
     @property
     def optimal(self) -> bool:
+        """Whether the walk was found, and so is proven shortest."""
         return self.walk is not None
 
     @property
     def steps(self) -> int | None:
+        """The number of steps of the walk; None where there is none."""
         return None if self.walk is None else len(self.walk) - 1
 
 

@@ -135,6 +135,7 @@ class StrokeNet(nn.Module):
     sights: int = 12
 
     def setup(self) -> None:
+        """Makes the layers."""
         self.eye = _Look(self.widths, self.blocks, self.features, self.sights)
         self.line = _Line()
 

@@ -1,6 +1,7 @@
 """Planning on real sand: a search in which every child is a height map that the simulator made."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,14 +12,17 @@ from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search.actions import Actions, Flat, Job, Lattice, Path, Rising, Steps, longest_stroke
 from jaxsand.planning.search.binary import binary_hints, binary_paths
-from jaxsand.planning.search.heights import search_heights
+from jaxsand.planning.search.heights import search_heights, with_the_best
 from jaxsand.planning.search.reach import blade_size, least_distance, volume_distance
 from jaxsand.planning.search.rollouts import Effort, distance, replay
 from jaxsand.planning.search.steps import search_steps
 from jaxsand.planning.search.strokes import search_strokes
 from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.relaxation.stopping import check_whole
-from jaxsand.scene.scene import Scene, as_array, fit
+from jaxsand.scene.scene import Scene, as_array, blade_of, fit
+from jaxsand.scene.tools import Blade
+
+_CHOICE = 0.25  # of the budget is for first plans with each of several blades
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ class SandPlan:
         tried.
       effort: how many pushes were simulated in full, and how many roughly (see `plan_sand`).
       reason: why there are no paths, and what to do; None where there are some.
+      tool: the blade, one of `tools` if there was a choice; None stands for the scene's.
       strokes: every stroke or leg [n, 4] = x0, y0, x1, y1 (m), or [n, 6] = x0, y0, z0, x1, y1, z1 (m) with heights, in
         order.
       gap: after - lower_bound (m).
@@ -60,6 +65,7 @@ class SandPlan:
     estimate: float
     effort: Effort
     reason: str | None = None
+    tool: Blade | None = None
 
     @property
     def gap(self) -> float:
@@ -87,6 +93,7 @@ def plan_sand(
     actions: Actions | None = None,
     budget: int = 4000,
     seed: int = 0,
+    tools: Sequence[Blade] = (),
 ) -> SandPlan:
     """Searches for strokes that bring a map close to a goal, by trying them on simulated sand.
 
@@ -97,7 +104,8 @@ def plan_sand(
 
     With `Rising` or `Flat` three plans compete: a coverage path, strokes along the plan of least work (optimal transport),
     and strokes that are each the best of many on the sand before them. The best plan's strokes are then varied one at a
-    time. `optimise_strokes(guess=plan.strokes)` goes on from there by gradients.
+    time. What a stroke will leave is foreseen in closed form, and only the most promising are pushed.
+    `optimise_strokes(guess=plan.strokes)` goes on from there by gradients.
 
     Args:
       scene: grid, sand and a `Blade`.
@@ -110,6 +118,8 @@ def plan_sand(
       budget: how many full pushes the search may cost at most; a rough push (`SwathPush()`, 8 sweeps) counts as 1/12. With
         too few for what it does at each stroke, it tries fewer strokes, or none.
       seed: equal seeds give equal plans.
+      tools: blades to choose from, with `Rising` or `Flat`; none leaves the scene's. A first plan is made with each, for a
+        quarter of the budget in all, and the one that leaves the sand closest to the goal makes the rest.
 
     Returns:
       A `SandPlan`; where nothing brings the sand closer to the goal it has no paths, and `reason` says why.
@@ -135,9 +145,14 @@ def plan_sand(
     actions = Lattice() if actions is None else actions
     height, wanted = _checked(scene, height), as_goal(scene, goal)
     _check_options(scene, actions, strokes, budget, seed)
-    job = Job(scene, height, wanted, strokes, actions)
-    before = float(distance(height, wanted))
-    paths, effort = _search(job, budget, np.random.default_rng(seed)) if before > 0 else ([], Effort())
+    job, rng, effort = Job(scene, height, wanted, strokes, actions), np.random.default_rng(seed), Effort()
+    before, paths = float(distance(height, wanted)), list[Path]()
+    if before > 0 and tools:
+        job, effort = with_the_best(job, _blades(tools, actions), _CHOICE * budget, rng)
+        scene = job.scene
+    if before > 0:
+        paths, more = _search(job, int(budget - effort.cost), rng)
+        effort += more
     after = replay(scene, height, paths)
     left = float(distance(after, wanted))
     if left > before:  # `follow` leaves slightly other maps than the search's own pushes
@@ -148,7 +163,19 @@ def plan_sand(
         bound = least_distance(scene, height, wanted, strokes, longest_stroke(scene, actions))
     estimate = min(left, max(0.0, before - strokes * effort.gain))
     reason = None if paths else why_no_strokes(scene, height, wanted)
-    return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason)
+    return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason, blade_of(scene))
+
+
+def _blades(tools: Sequence[Blade], actions: Actions) -> tuple[Blade, ...]:
+    """The blades to choose from; ValueError unless they are some that go with the actions."""
+    if not isinstance(actions, Rising | Flat):
+        raise ValueError(
+            f"tools: got a choice with {type(actions).__name__}(); it goes with Rising() or Flat(), leave it out"
+        )
+    for tool in tools:
+        if not isinstance(tool, Blade):
+            raise ValueError(f"tools: got {type(tool).__name__}; give blades")
+    return tuple(tools)
 
 
 def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:

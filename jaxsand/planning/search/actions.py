@@ -80,7 +80,14 @@ class Rising:
     highest: float = math.inf
 
     def allowed(self, heights: np.ndarray) -> np.ndarray:
-        """Heights [n, 2] (m) at the ends of strokes, within the bounds."""
+        """Heights that strokes may have: those given, brought within `lowest` and `highest`.
+
+        Args:
+          heights: of the tool's bottom at the start and the end of each stroke, [n, 2] (m).
+
+        Returns:
+          [n, 2] (m).
+        """
         return np.clip(heights, self.lowest, self.highest)
 
 
@@ -108,7 +115,14 @@ class Flat:
     highest: float = math.inf
 
     def allowed(self, heights: np.ndarray) -> np.ndarray:
-        """Heights [n, 2] (m) at the ends of strokes, both the start's, within the bounds."""
+        """Heights that strokes may have: at both ends the start's, brought within `lowest` and `highest`.
+
+        Args:
+          heights: of the tool's bottom at the start and the end of each stroke, [n, 2] (m).
+
+        Returns:
+          [n, 2] (m).
+        """
         return np.clip(np.repeat(heights[:, :1], 2, axis=1), self.lowest, self.highest)
 
 

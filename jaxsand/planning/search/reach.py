@@ -1,21 +1,8 @@
 """How much a stroke can change a map at most, and so how close to a goal a number of strokes can come.
 
-Settling is the gradient flow of a convex function of the heights, so it brings no two maps farther apart in l2. With rates
-in the stable range it also keeps the order of maps (if h <= h' everywhere, this stays so) and their volume, so it brings no
-two farther apart in l1. The argument uses the order. Let h be a map at rest, S the cells that the blade covers in some
-strokes, -d the height of its bottom and mu = tan(angle of repose). Then
-
-    u(x) = min(h(x), -d + mu dist(x, S))
-
-is at rest too, since neither part is steeper than mu. Whatever these strokes do, the map stays above u: the blade takes only
-what lies above -d in the cells it covers, sand set down raises the map, and settling, with a blade in the way or without,
-keeps it above u, which does not move. So n strokes that cover S_1, ..., S_n lower the map by no more than
-
-    sum (h - h')+  <=  sum max_k (h - u_k)  <=  n A,    A = max over strokes of sum (h - u)
-
-and, as sand is conserved, raise it by no more. The largest A over all strokes is found on a lattice of placements of a
-rectangle as long as the longest stroke, widened by as much as a placement in between may lie off (see `most_lowered`).
-Valid for 4 and 8 neighbours, in exact arithmetic, for sand that settles by small steps to tolerance 0.
+No stroke lowers a map at rest by more than A, summed over its cells, nor raises it by more. The proof, and the least
+distance that follows from it: notebooks/site/theory/planning.md ("How much a stroke can do"). Valid for 4 and 8
+neighbours, in exact arithmetic, for sand that settles by small steps to tolerance 0.
 """
 
 import math
@@ -24,26 +11,27 @@ import numpy as np
 
 from jaxsand.goals.goal import Goal, Power
 from jaxsand.scene.boundaries import Closed
+from jaxsand.scene.grid import places
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, square
 
 
 def least_distance(scene: Scene, height: np.ndarray, goal: Goal, strokes: int, longest: float) -> float:
-    """A proven lower bound (m) of the distance from `goal` after at most `strokes` strokes from `height`, which is at rest.
+    """A proven lower bound (m) of the distance from `goal` after at most `strokes` strokes.
 
-    It is the solution of
-
-        min distance(h + v)   with   sum v-  <=  n A,   sum v+  <=  n A,   v-  <=  (h + d)+,
-
-    which for squares cuts surplus and lack off at one level of weight times height each. Where the cost says so, a cell has
-    neither. The distance is also at least `volume_distance`; for isotropic sand, whose A is not proven, only that is used.
+    It is the least distance of any map that the strokes could leave if each moved as much sand as `most_lowered` allows, to
+    where it helps most, and never less than `volume_distance`. In isotropic sand, where `most_lowered` is not proven, it is
+    `volume_distance` alone.
 
     Args:
       scene: grid, sand and blade.
-      height: the map [H, W] (m).
+      height: the map [H, W] (m) to begin from, at rest.
       goal: what is wanted.
-      strokes: n.
+      strokes: how many strokes may be made.
       longest: the longest stroke allowed (m).
+
+    Raises:
+      ValueError: for a scene without a blade.
     """
     surplus, uneven = goal.off(np.asarray(height, float)), volume_distance(scene, height, goal)
     if scene.grid.neighbours == "isotropic":
@@ -59,11 +47,11 @@ def least_distance(scene: Scene, height: np.ndarray, goal: Goal, strokes: int, l
 
 
 def volume_distance(scene: Scene, height: np.ndarray, goal: Goal) -> float:
-    """The distance (m) that is left however the sand is moved, because the goal has more sand than the map, or less.
+    """The distance (m) to the goal that remains however the sand is moved, since there is more of it than the goal has, or
+    less.
 
-    The least of sum w_i x_i^p with sum x_i = V is V^2 / sum (1 / w_i) or, with p = 1, V min w_i. For weights of 1 and p = 2
-    that is the l2 distance of the mean heights. It is 0 where sand drains, where a cell is free, or where what there is too
-    much or too little of costs nothing somewhere.
+    That difference in volume has to lie somewhere: it is spread where it costs least. The distance is 0 where sand drains
+    off the map, where a cell is free, and where some cell takes the difference at no cost.
     """
     if not isinstance(scene.edge, Closed) or goal.free.any():
         return 0.0
@@ -79,7 +67,7 @@ def most_lowered(scene: Scene, height: np.ndarray, longest: float) -> float:
 
     Every stroke lies within a rectangle of the full length about the stroke's middle. Rectangles are tried with the middle
     on a lattice of half a spacing and with 64 headings. Any other lies at most delta = sqrt(2) dx / 4 + (half the
-    rectangle's diagonal) (pi / 128) off one of these, so the distance to S is shortened by delta.
+    rectangle's diagonal) (pi / 128) off one of these, so the distance to the cells that it covers is shortened by delta.
     """
     width, thickness, depth = blade_size(scene)
     dx = float(scene.grid.spacing)
@@ -89,13 +77,13 @@ def most_lowered(scene: Scene, height: np.ndarray, longest: float) -> float:
     long, wide = (longest + thickness + dx) / 2, (width + dx) / 2  # the blade's share of a cell fades over a spacing
     headings, pitch = 64, dx / 2
     delta = pitch / math.sqrt(2) + math.hypot(long, wide) * math.pi / (2 * headings)
-    x, y = (np.arange(columns) + 0.5) * dx, (np.arange(rows) + 0.5) * dx
+    x, y = places((rows, columns), dx)
     middles_x, middles_y = np.arange(0, columns * dx + pitch / 2, pitch), np.arange(0, rows * dx + pitch / 2, pitch)
     most = 0.0
     for heading in np.arange(headings) * math.pi / headings:
         cos, sin = math.cos(heading), math.sin(heading)
         for my in middles_y:
-            px, py = x - middles_x[:, None, None], (y - my)[:, None]
+            px, py = x[0] - middles_x[:, None, None], y[:, :1] - my
             beyond = np.maximum(np.abs(px * cos + py * sin) - long, 0)
             aside = np.maximum(np.abs(py * cos - px * sin) - wide, 0)
             rise = mu * np.maximum(np.sqrt(beyond**2 + aside**2) - delta, 0)
@@ -113,8 +101,14 @@ def blade_size(scene: Scene) -> tuple[float, float, float]:
 
 
 def _cut_off(excess: np.ndarray, weight: np.ndarray, at_most: np.ndarray | float, amount: float, power: Power) -> np.ndarray:
-    """What is left of `excess`, at the least sum weight left^power, when `amount` in all and at most `at_most` of each cell
-    may be taken away.
+    """The excess [H, W] (m) that is left when as much as possible is taken away, where it costs most.
+
+    Args:
+      excess: how far each cell is from the goal, 0 or more (m).
+      weight: what it costs: sum weight excess^power.
+      at_most: how much may be taken from each cell (m).
+      amount: how much may be taken in all, a sum of heights (m).
+      power: 1 or 2.
     """
     taken = np.minimum(excess, at_most)
     if taken.sum() <= amount:
@@ -134,5 +128,8 @@ def _cut_off(excess: np.ndarray, weight: np.ndarray, at_most: np.ndarray | float
 
 
 def _above(excess: np.ndarray, level: float, each: np.ndarray, at_most: np.ndarray | float) -> np.ndarray:
-    """What lies above a level of weight times height, of weights 1 / `each`, and at most `at_most`."""
+    """By how much each cell's weight times excess is above a level, as a height (m), but `at_most` at most.
+
+    `each` is 1 over the cell's weight, inf for a weight of 0, from which nothing is taken.
+    """
     return np.clip(excess - np.where(np.isinf(each), np.inf, level * each), 0, at_most)

@@ -7,10 +7,11 @@ from functools import cache
 import numpy as np
 
 from jaxsand.goals import metrics, surfaces
-from jaxsand.goals.surfaces import places, rested, rough_surface
+from jaxsand.goals.surfaces import rested, rough_surface
 from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
 from jaxsand.planning.search.actions import Actions, Lattice, Steps
 from jaxsand.planning.search.rollouts import replay
+from jaxsand.scene.grid import places
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade
 
