@@ -3,8 +3,10 @@
 import ast
 import inspect
 import os
+import re
 import subprocess
 import sys
+from collections import defaultdict
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -142,3 +144,39 @@ def test_nothing_tells_to_run_the_learners_without_saying_where_they_are():
                 told += 1
                 assert "checkout" in node.value, f"{path}: {node.value}"
     assert told
+
+
+FORBIDDEN = {"march", "surge"}  # private words for what the field has a name for
+
+
+def words(tree):
+    """The words of every name that a file defines or uses: `batch_of_maps` and `BatchOfMaps` have three."""
+    for node in ast.walk(tree):
+        for name in (getattr(node, field, None) for field in ("name", "id", "attr", "arg")):
+            if isinstance(name, str):
+                yield from (word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name))
+
+
+def test_the_code_uses_the_words_of_the_field():
+    for path in PACKAGE.rglob("*.py"):
+        used = {word.removesuffix("s") for word in words(ast.parse(path.read_text(encoding="utf-8")))}
+        assert not used & FORBIDDEN, f"{path}: {used & FORBIDDEN}"
+
+
+def test_derivatives_of_loops_are_called_jvp_and_vjp():
+    """A push is what a tool does to the sand."""
+    for room in ("autodiff", "relaxation", "interaction"):
+        for path in (PACKAGE / room).rglob("*.py"):
+            defined = {
+                n.name for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.FunctionDef)
+            }
+            assert not defined & {"push", "pull"}, path
+
+
+def test_a_class_has_a_name_of_its_own():
+    homes = defaultdict(list)
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                homes[node.name].append(str(path.relative_to(PACKAGE)))
+    assert not {name: where for name, where in homes.items() if len(where) > 1}

@@ -10,12 +10,15 @@ must not change a map that is done, and its `done` returns one boolean for all m
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
+
+if TYPE_CHECKING:
+    from jaxsand.autodiff.while_loop import Step, TrailingStep
 
 Tree = Any
 Done = Callable[[Tree, jax.Array, Tree], jax.Array]
@@ -29,14 +32,14 @@ class Loop:
 
     Attributes:
         done: whether a map stops before step k; None where all take `bound` steps.
-        step: a `while_loop.Step`.
+        step: the step; a `TrailingStep` if it computes a batch in the last axis.
         bound: largest number of steps.
         batch_axes: number of leading batch axes of the state.
         width: size of the trailing batch, 0 where there is none.
     """
 
     done: Done | None
-    step: Any
+    step: "Step"
     bound: int
     batch_axes: int
     width: int = 0
@@ -56,8 +59,8 @@ class Loop:
         done = None if self.done is None else jax.vmap(self.done, in_axes=(axes, None, 0))
         return Loop(done, _Many(self.step, axes), self.bound, self.batch_axes + 1)
 
-    def finished(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
-        """Which maps are finished before step k: booleans with the leading batch axes, one for a whole trailing batch."""
+    def ended(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
+        """Which maps have ended before step k: booleans with the leading batch axes, one for a whole trailing batch."""
         over = k >= self.bound
         return over if self.done is None else over | self.done(params, k, state)
 
@@ -77,12 +80,12 @@ class Loop:
         """Which maps had stopped before step k."""
         return jnp.zeros((), bool) if count is None else k >= count
 
-    def keep(self, finished: jax.Array, old: Tree, new: Tree) -> Tree:
-        """The state after a step: the old one of the maps that were finished before it, the new one of the others."""
-        if not self.batch_axes or not finished.ndim:
+    def keep(self, ended: jax.Array, old: Tree, new: Tree) -> Tree:
+        """The state after a step: the old one of the maps that had ended before it, the new one of the others."""
+        if not self.batch_axes or not ended.ndim:
             return new
         return jax.tree.map(
-            lambda x, y: jnp.where(finished.reshape(finished.shape + (1,) * (x.ndim - self.batch_axes)), x, y), old, new
+            lambda x, y: jnp.where(ended.reshape(ended.shape + (1,) * (x.ndim - self.batch_axes)), x, y), old, new
         )
 
     def put(self, tape: Tree, k: jax.Array, record: Tree) -> Tree:
@@ -105,18 +108,18 @@ class Loop:
 class _Many:
     """A step with one more leading batch axis."""
 
-    def __init__(self, step: Any, axes: Tree) -> None:
+    def __init__(self, step: "Step", axes: Tree) -> None:
         self.tape = step.tape
         self.call = jax.vmap(step, in_axes=(axes, None, 0))
         self.recorded = jax.vmap(step.recorded, in_axes=(axes, None, 0))
-        self.push = jax.vmap(step.push, in_axes=(axes, None, 0, 0, 0))
-        self.pull = jax.vmap(step.pull, in_axes=(axes, None, 0, 0))
+        self.jvp = jax.vmap(step.jvp, in_axes=(axes, None, 0, 0, 0))
+        self.vjp = jax.vmap(step.vjp, in_axes=(axes, None, 0, 0))
 
     def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree:
         return self.call(params, k, state)
 
 
-def batched(program: Callable[..., Any], loop: Loop, params: Tree, *rest: Tree) -> Tree:
+def batched(program: Callable[..., Tree], loop: Loop, params: Tree, *rest: Tree) -> Tree:
     """`program(loop, params, *rest)`; under `vmap` the same program with one more batch axis, which all of `rest` gains."""
 
     @custom_vmap
@@ -124,7 +127,7 @@ def batched(program: Callable[..., Any], loop: Loop, params: Tree, *rest: Tree) 
         return program(loop, params, *rest)
 
     @run.def_vmap
-    def rule(size: int, mapped: list[Any], params: Tree, rest: Tree) -> tuple[Tree, Tree]:
+    def rule(size: int, mapped: list[Tree], params: Tree, rest: Tree) -> tuple[Tree, Tree]:
         if loop.trailing:
             out = _trailing(program, loop, size, mapped, (params, rest))
             return out, jax.tree.map(lambda _: True, out)
@@ -136,7 +139,7 @@ def batched(program: Callable[..., Any], loop: Loop, params: Tree, *rest: Tree) 
     return run(params, rest)
 
 
-def _trailing(program: Callable[..., Any], loop: Loop, size: int, mapped: list[Any], args: Tree) -> Tree:
+def _trailing(program: Callable[..., Tree], loop: Loop, size: int, mapped: list[Tree], args: Tree) -> Tree:
     """`program` with one more batch of `size` maps in the last axis, chunk by chunk; in the result it is the first axis.
 
     `mapped` says which leaves of `args`, the params and the rest, have the batch axis. A chunk takes as many steps as its
@@ -144,11 +147,12 @@ def _trailing(program: Callable[..., Any], loop: Loop, size: int, mapped: list[A
     """
     leaves, tree = jax.tree.flatten(args)
     yes = jax.tree.leaves(mapped)
-    chunk = min(size, loop.step.together)
+    step = cast("TrailingStep", loop.step)
+    chunk = min(size, step.together)
     chunks = -(-size // chunk)
     chunk = -(-size // chunks)
 
-    def one_chunk(part: list[Any]) -> Tree:
+    def one_chunk(part: list[jax.Array]) -> Tree:
         own = iter(part)
 
         def batch_last(x: jax.Array, batched: bool) -> jax.Array:
@@ -172,7 +176,7 @@ def _trailing(program: Callable[..., Any], loop: Loop, size: int, mapped: list[A
     order = place = jnp.arange(size)
     if loop.done is not None:
         axes = jax.tree.map(lambda y: 0 if y else None, mapped[0])
-        work = jax.vmap(loop.step.work, in_axes=(axes,), axis_size=size)(args[0])
+        work = jax.vmap(step.work, in_axes=(axes,), axis_size=size)(args[0])
         order = jnp.argsort(jnp.max(work.reshape(size, -1), axis=1))
         place = jnp.argsort(order)
     order = jnp.concatenate([order, jnp.broadcast_to(order[-1:], (extra,))])
@@ -184,39 +188,65 @@ def run(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree]:
     """Runs the loop: the last state, and the number of steps."""
 
     def advance(carry: Tree) -> Tree:
-        state, k, count, finished = carry
-        state = loop.keep(finished, state, loop.step(params, k, state))
-        k, count = k + 1, count + (~finished).astype(jnp.int32)
-        return state, k, count, finished | loop.finished(params, k, state)
+        state, k, count, ended = carry
+        state = loop.keep(ended, state, loop.step(params, k, state))
+        k, count = k + 1, count + (~ended).astype(jnp.int32)
+        return state, k, count, ended | loop.ended(params, k, state)
 
     zero = jnp.int32(0)
-    finished = loop.finished(params, zero, state)
+    ended = loop.ended(params, zero, state)
     state, _, count, _ = lax.while_loop(
-        lambda c: ~jnp.all(c[3]), advance, (state, zero, jnp.zeros(finished.shape, jnp.int32), finished)
+        lambda c: ~jnp.all(c[3]), advance, (state, zero, jnp.zeros(ended.shape, jnp.int32), ended)
     )
     return state, loop.taken(count)
 
 
-def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tree]:
-    """Runs the loop, and keeps what reverse mode needs.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Memory:
+    """States of a long loop that the forward pass kept.
 
-    Returns:
-        The last state; the number of steps that each map took, None where all take `bound`; the tape, which holds what
-        step k recorded in place k % `loop.room`, for the last `loop.room` steps; and the memory, empty where the tape
-        holds every step. Else the memory is a pair: the steps before which states were kept, -1 for a free slot, and
-        these states.
+    Attributes:
+        places: the steps before which they were, -1 for a free slot.
+        saved: these states.
     """
 
+    places: jax.Array
+    saved: Tree
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Forward:
+    """A loop that ran, as reverse mode needs it.
+
+    Attributes:
+        end: the last state.
+        count: the number of steps that each map took, or None where all take `Loop.bound`.
+        tape: what step k recorded in place k % `Loop.room`, for the last `Loop.room` steps.
+        memory: earlier states, or None where the tape holds every step.
+    """
+
+    end: Tree
+    count: jax.Array | None
+    tape: Tree
+    memory: Memory | None
+
+
+def record(loop: Loop, params: Tree, state: Tree) -> Forward:
+    """Runs the loop, and keeps what reverse mode needs."""
+
     def advance(carry: Tree) -> Tree:
-        state, k, count, finished, tape = carry
+        state, k, count, ended, tape = carry
         new, record = loop.step.recorded(params, k, state)
         tape = loop.put(tape, k % loop.room, record)
-        state = loop.keep(finished, state, new)
-        k, count = k + 1, count + (~finished).astype(jnp.int32)
-        return state, k, count, finished | loop.finished(params, k, state), tape
+        state = loop.keep(ended, state, new)
+        k, count = k + 1, count + (~ended).astype(jnp.int32)
+        return state, k, count, ended | loop.ended(params, k, state), tape
 
     def stretch(carry: Tree) -> Tree:
-        carry, stride, (places, saved) = carry
+        carry, stride, memory = carry
+        places, saved = memory.places, memory.saved
         k = carry[1]
         full = jnp.sum(places >= 0) == KEPT
         stride = jnp.where(full, 2 * stride, stride)
@@ -225,38 +255,40 @@ def record(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree, Tree, Tre
         saved = loop.put(saved, slot, carry[0])
         places = places.at[slot].set(jnp.where(k % stride == 0, k, -1))
         carry = lax.while_loop(lambda c: (c[1] < k + loop.room) & ~jnp.all(c[3]), advance, carry)
-        return carry, stride, (places, saved)
+        return carry, stride, Memory(places, saved)
 
     zero = jnp.int32(0)
-    finished = loop.finished(params, zero, state)
+    ended = loop.ended(params, zero, state)
     _, record = jax.eval_shape(loop.step.recorded, params, zero, state)
-    carry = (state, zero, jnp.zeros(finished.shape, jnp.int32), finished, loop.blank(loop.room, record))
+    carry = (state, zero, jnp.zeros(ended.shape, jnp.int32), ended, loop.blank(loop.room, record))
     if loop.bound <= loop.room:
         state, _, count, _, tape = lax.while_loop(lambda c: ~jnp.all(c[3]), advance, carry)
-        return state, loop.taken(count), tape, ()
+        return Forward(state, loop.taken(count), tape, None)
     slots = min(-(-loop.bound // loop.room), KEPT + SPARE)
-    memory = (jnp.full(slots, -1, jnp.int32), loop.blank(slots, state))
-    (state, _, count, _, tape), _, (places, saved) = lax.while_loop(
+    memory = Memory(jnp.full(slots, -1, jnp.int32), loop.blank(slots, state))
+    (state, _, count, _, tape), _, memory = lax.while_loop(
         lambda c: ~jnp.all(c[0][3]), stretch, (carry, jnp.int32(loop.room), memory)
     )
-    places = jnp.broadcast_to(places, (*jax.tree.leaves(state)[0].shape[: loop.batch_axes], slots))
+    places = jnp.broadcast_to(memory.places, (*jax.tree.leaves(state)[0].shape[: loop.batch_axes], slots))
     places = loop.for_each_map(places)
-    return state, loop.taken(count), tape, (places, saved)
+    return Forward(state, loop.taken(count), tape, Memory(places, memory.saved))
 
 
-def push(loop: Loop, params: Tree, state: Tree, count: jax.Array, dparams: Tree, dstate: Tree) -> Tree:
+def jvp(loop: Loop, params: Tree, state: Tree, count: jax.Array | None, dparams: Tree, dstate: Tree) -> Tree:
     """The jvp of the loop: the tangent of the last state. Computes the steps again."""
 
     def one(k: jax.Array, carry: Tree) -> Tree:
         x, dx = carry
         new, record = loop.step.recorded(params, k, x)
-        dnew = loop.step.push(params, k, record, dparams, dx)
+        dnew = loop.step.jvp(params, k, record, dparams, dx)
         return loop.keep(loop.beyond(k, count), carry, (new, dnew))
 
     return lax.fori_loop(0, loop.total(count), one, (state, dstate))[1]
 
 
-def pull(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+def vjp(
+    loop: Loop, params: Tree, count: jax.Array | None, tape: Tree, memory: Memory | None, cotangent: Tree
+) -> tuple[Tree, Tree]:
     """The vjp of the loop: the cotangents of params and of the first state, computed from the last step backwards.
 
     `tape` and `memory` are those of `record`. Records that are no longer on the tape are computed anew from the last state
@@ -264,30 +296,30 @@ def pull(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, c
     """
     total = loop.total(count)
 
-    def pull_back(first: jax.Array, end: jax.Array, tape: Tree, carry: Tree) -> Tree:
+    def backwards(first: jax.Array, end: jax.Array, tape: Tree, carry: Tree) -> Tree:
         """The cotangents before step `first`, from `carry`, those before step `end`; the tape holds the steps between."""
 
         def one(j: jax.Array, carry: Tree) -> Tree:
             # The record is part of what is carried: XLA would fetch it anew for all that uses it.
             (cf, cx), record = carry
             k = end - 1 - j
-            df, dx = loop.step.pull(params, k, record, cx)
+            df, dx = loop.step.vjp(params, k, record, cx)
             carry = loop.keep(loop.beyond(k, count), (cf, cx), (jax.tree.map(jnp.add, cf, df), dx))
             return carry, loop.get(tape, (k - 1) % loop.room)
 
         return lax.fori_loop(0, end - first, one, (carry, loop.get(tape, (end - 1) % loop.room)))[0]
 
-    floats = jax.eval_shape(loop.step.pull, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
+    floats = jax.eval_shape(loop.step.vjp, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
     carry = (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), floats), cotangent)
     if loop.bound <= loop.room:
-        return pull_back(jnp.int32(0), total, tape, carry)
+        return backwards(jnp.int32(0), total, tape, carry)
 
     def again(k: jax.Array, c: Tree) -> Tree:
         new, record = loop.step.recorded(params, k, c[0])
         return loop.keep(loop.beyond(k, count), c[0], new), loop.put(c[1], k % loop.room, record)
 
     def stretch(c: Tree) -> Tree:
-        # The steps from `end` on are pulled back; `fresh` is whether the tape still is that of the forward pass.
+        # The steps from `end` on are done; `fresh` is whether the tape still is that of the forward pass.
         end, fresh, places, saved, tape, carry = c
         before = jnp.where(places < end, places, -1)
         slot, place, free = jnp.argmax(before), jnp.max(before), jnp.argmin(places)
@@ -298,10 +330,11 @@ def pull(loop: Loop, params: Tree, count: jax.Array, tape: Tree, memory: Tree, c
         saved = lax.fori_loop(0, halve.astype(jnp.int32), lambda _, saved: loop.put(saved, free, state), saved)
         places = places.at[free].set(jnp.where(halve, goal, places[free]))
         first = jnp.where(halve, end, jnp.maximum(end - loop.room, jnp.where(fresh, 0, place)))
-        carry = pull_back(first, end, tape, carry)
+        carry = backwards(first, end, tape, carry)
         return first, jnp.zeros((), bool), jnp.where(places < first, places, -1), saved, tape, carry
 
-    places, saved = memory
+    assert memory is not None
+    places = memory.places
     places = places[:, 0] if loop.width else places.reshape(-1, places.shape[-1])[0]
-    start = (total, jnp.ones((), bool), places, saved, tape, carry)
+    start = (total, jnp.ones((), bool), places, memory.saved, tape, carry)
     return lax.while_loop(lambda c: c[0] > 0, stretch, start)[-1]

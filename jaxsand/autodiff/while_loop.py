@@ -17,7 +17,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxsand.autodiff import _batched_while
-from jaxsand.autodiff._batched_while import Done, Loop
+from jaxsand.autodiff._batched_while import Done, Forward, Loop
 
 Tree: TypeAlias = _batched_while.Tree
 
@@ -38,11 +38,24 @@ class Step(Protocol):
     def recorded(self, params: Tree, k: jax.Array, state: Tree, /) -> tuple[Tree, Tree]:
         """The state after step k, and a record of what the derivatives of the step need."""
 
-    def push(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree, /) -> Tree:
+    def jvp(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree, /) -> Tree:
         """The jvp: the tangent of the state after step k, from those of params and of the state before."""
 
-    def pull(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree, /) -> tuple[Tree, Tree]:
+    def vjp(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree, /) -> tuple[Tree, Tree]:
         """The vjp: the cotangents of params and of the state before step k, from that of the state after."""
+
+
+class TrailingStep(Step, Protocol):
+    """A step that computes a batch by itself, in the last axis of all arrays; see _batched_while.py."""
+
+    trailing: bool
+
+    @property
+    def together(self) -> int:
+        """The number of maps that are computed at a time, at most."""
+
+    def work(self, params: Tree, /) -> jax.Array:
+        """A number that grows with the steps that a map takes."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +77,12 @@ class Plain:
         """The state after step k, and the state before it as the record."""
         return self.body(params, k, state), state
 
-    def push(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree) -> Tree:
+    def jvp(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree) -> Tree:
         """The jvp, by JAX."""
         floats, merge = split(params)
         return jax.jvp(lambda f, x: self.body(merge(f), k, x), (floats, record), (dparams, dstate))[1]
 
-    def pull(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+    def vjp(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
         """The vjp, by JAX."""
         floats, merge = split(params)
         return jax.vjp(lambda f, x: self.body(merge(f), k, x), floats, record)[1](cotangent)
@@ -141,28 +154,29 @@ def _loop_jvp(loop: Loop, primals: Tree, tangents: Tree) -> Tree:
     params, state = first_order(primals)
     dparams, dstate = tangents
     dparams = tuple(d for d in jax.tree.leaves(dparams) if d.dtype != jax.dtypes.float0)
-    end, count, tape, saved = _batched_while.batched(_batched_while.record, loop, params, state)
+    ran: Forward = _batched_while.batched(_batched_while.record, loop, params, state)
+    count = ran.count
     none = None if count is None else np.zeros(count.shape, jax.dtypes.float0)
     if not jax.tree.leaves((dparams, dstate)):
-        return (end, count), (dstate, none)
-    kept, shown = hidden((params, state, tape, saved))
+        return (ran.end, count), (dstate, none)
+    kept, shown = hidden((params, state, ran.tape, ran.memory))
     # One flat vector, so that vmap sees a single operand that is batched or not.
     start, unravel = ravel_pytree((dparams, dstate))
 
     def forward(_: object, vector: jax.Array) -> jax.Array:
         df, dx = unravel(vector)
         params, state, *_ = shown(kept)
-        return ravel_pytree((df, _batched_while.batched(_batched_while.push, loop, params, state, count, df, dx)))[0]
+        return ravel_pytree((df, _batched_while.batched(_batched_while.jvp, loop, params, state, count, df, dx)))[0]
 
     def backward(_: object, vector: jax.Array) -> jax.Array:
         cf, cx = unravel(vector)
-        params, _, tape, saved = shown(kept)
-        df, dx = _batched_while.batched(_batched_while.pull, loop, params, count, tape, saved, cx)
+        params, _, tape, memory = shown(kept)
+        df, dx = _batched_while.batched(_batched_while.vjp, loop, params, count, tape, memory, cx)
         return ravel_pytree((jax.tree.map(jnp.add, cf, df), dx))[0]
 
     # The solution of "identity times x = start" by rules of our own: how JAX is told a linear map and its transpose.
     out = unravel(lax.custom_linear_solve(lambda v: v, start, forward, backward))
-    return (end, count), (out[1], none)
+    return (ran.end, count), (out[1], none)
 
 
 def hidden(tree: Tree) -> tuple[Tree, Callable[[Tree], Tree]]:

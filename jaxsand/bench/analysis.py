@@ -13,14 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsand.bench.rivals.plain import settle_numpy
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import seconds_of, timed
 from jaxsand.bench.work_precision import COLUMN, RIDGE, distance, trench
-from jaxsand.relaxation.flux import Nothing
+from jaxsand.relaxation.flux import WholeCells
 from jaxsand.relaxation.ghost_cells import at, halo, largest, prepare, quantum
 from jaxsand.relaxation.schemes import Relaxation
 from jaxsand.relaxation.settling import relax, settle, settle_batch
 from jaxsand.relaxation.stopping import UntilStill
-from jaxsand.relaxation.sweep import Flow, sweep
+from jaxsand.relaxation.sweep import Flow, Swept, sweep
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 
@@ -29,7 +30,7 @@ _BOUND = 4000
 _RATES = (0.04, 0.06, 0.08, 0.1, 0.125, 1 / 6.83, 0.16, 0.18, 0.2, 1 / 4.83, 0.22, 0.25)
 
 
-def sweeps_against_rate(n: int = 32) -> list[dict[str, Any]]:
+def sweeps_against_rate(n: int = 32) -> list[Row]:
     """Sweeps to stillness (slope tolerance 1e-2) of the paper's sweep at flow rates k = rate dx^2 (dx in one dimension), in
     float64 and beyond the stable range too: None where it never comes to rest."""
     rows = []
@@ -54,12 +55,12 @@ def sweeps_against_rate(n: int = 32) -> list[dict[str, Any]]:
     return rows
 
 
-def sweeps_against_resolution(sides: tuple[int, ...] = (32, 64, 96, 128, 160)) -> list[dict[str, Any]]:
+def sweeps_against_resolution(sides: tuple[int, ...] = (32, 64, 96, 128, 160)) -> list[Row]:
     """Sweeps of the paper's sweep at k = dx^2 / 8 for one trench on ever finer grids, for several tolerances."""
     rows = []
     for n in sides:
         scene, h = make_scene((n, n), 1.0, _ANGLE), jnp.asarray(trench(n), jnp.float32)
-        row: dict[str, Any] = {"cells": n}
+        row: Row = {"cells": n}
         for tolerance in (0.1, 0.03, 0.01, 1e-3):
             settled = settle(scene, h, scheme=Relaxation(), stop=UntilStill(tolerance, interval=1))
             row[f"tolerance {tolerance:g}"] = int(settled.sweeps)
@@ -67,14 +68,14 @@ def sweeps_against_resolution(sides: tuple[int, ...] = (32, 64, 96, 128, 160)) -
     return rows
 
 
-def activity(n: int = 160, sweeps: int = 1000) -> dict[str, Any]:
+def activity(n: int = 160, sweeps: int = 1000) -> Row:
     """Cells that a sweep of the trench would have to visit: all, those in the box around what moves, those that move."""
     scene = make_scene((n, n), 1.0, _ANGLE)
     bed, h = prepare(scene), jnp.asarray(trench(n), jnp.float32)
     flow = Flow(jnp.float32(0.125), quantum(largest(h)))
 
     def one(u: jax.Array, _: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        after = sweep(bed, flow, Nothing(), u, None)[0]
+        after = sweep(bed, flow, WholeCells(), Swept(u, None)).height
         moved = jnp.abs(at(after) - at(u)) > 1e-3 * bed.drop
         sides = [jnp.any(moved, axis=axis) for axis in (0, 1)]
         spans = [jnp.max(jnp.where(s, jnp.arange(n), -1)) - jnp.min(jnp.where(s, jnp.arange(n), n)) + 3 for s in sides]
@@ -91,13 +92,13 @@ def activity(n: int = 160, sweeps: int = 1000) -> dict[str, Any]:
     }
 
 
-def chunks(scene: Scene, heights: jax.Array, tell: Tell = quiet) -> list[dict[str, Any]]:
+def chunks(scene: Scene, heights: jax.Array, tell: Tell = quiet) -> list[Row]:
     """Maps a second of `settle_batch` by the size of a chunk, called from one thread and from one for each core, and with a
     tall column in one map of every 256 (`with_slow`; `sweeps` is then the largest number of sweeps, and the mean)."""
     high, wide = heights.shape[1:]
     middle = jnp.s_[high // 2 - 3 : high // 2 + 3, wide // 2 - 3 : wide // 2 + 3]
     slow = heights.at[(slice(None, None, 256), *middle)].add(100 * scene.grid.spacing)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for chunk in (8, 32, 64, 128, 256):
         tell(f"chunks of {chunk}")
         many = len(heights)
@@ -129,7 +130,7 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, here)
 
 
-def peer(batch: int = 256, tell: Tell = quiet) -> list[dict[str, Any]]:
+def peer(batch: int = 256, tell: Tell = quiet) -> list[Row]:
     """60 x 30 cells of 10 mm, a block of 20 x 10 cells and 40 mm, 30 degrees: the case on which an open-source sand-shaping
     gym reports 671 iterations and 0.33 s in numpy."""
     tell("the peer's case")
@@ -140,7 +141,7 @@ def peer(batch: int = 256, tell: Tell = quiet) -> list[dict[str, Any]]:
         exact = settle(scene, jnp.asarray(h, jnp.float64), scheme=Relaxation(1 / 64), stop=UntilStill(1e-6, 400_000, 64))
         end = np.asarray(exact.height)
     seconds, (plain, sweeps) = seconds_of(partial(settle_numpy, h, 0.01, math.tan(math.radians(30))))
-    rows: list[dict[str, Any]] = [
+    rows: list[Row] = [
         {"name": "numpy, paper's sweep", "sweeps": sweeps, "seconds": seconds, "error": distance(plain, end, h)}
     ]
     maps = jnp.broadcast_to(jnp.asarray(h), (batch, 60, 30))

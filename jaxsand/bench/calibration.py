@@ -3,10 +3,11 @@ can have, and of a cone that is known exactly, beside the error that is stated."
 
 import math
 from functools import partial
-from typing import Any
 
+import jax
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import seconds_of
 from jaxsand.goals.usual import SHAPE, SPACING
 from jaxsand.interaction.blade_closed_form import SwathPush
@@ -31,7 +32,7 @@ _PARTS = 16  # of a cell's side, for means over cells
 _FREE = ("repose_angle",)
 
 
-def bench_calibrate(tell: Tell = quiet, seeds: int = 50) -> list[dict[str, Any]]:
+def bench_calibrate(tell: Tell = quiet, seeds: int = 50) -> list[Row]:
     """For three experiments in the simulator's own sand: the rms and the largest error of the angle of repose, and the rms
     of the noise's standard errors (at the optimum the Cramer-Rao bound), in degrees, over so many angles and noises.
     Strokes are swaths: the fast push."""
@@ -61,7 +62,7 @@ def bench_calibrate(tell: Tell = quiet, seeds: int = 50) -> list[dict[str, Any]]
     return rows
 
 
-def bench_cone(tell: Tell = quiet, seeds: int = 100) -> list[dict[str, Any]]:
+def bench_cone(tell: Tell = quiet, seeds: int = 100) -> list[Row]:
     """For every neighbourhood, over so many noises on the exact cone of 29 degrees: the mean angle that best explains it,
     and the mean of the noise's, the grid's and the whole stated standard error (degrees); in which share of the trials the
     cone's angle lies within two of the noise's, and within two of the whole; the same of `sand`, the estimate without the
@@ -133,7 +134,7 @@ def _found(true: Scene, guess: Scene, before: np.ndarray, seed: int) -> tuple[fl
     return math.degrees(found.values["repose_angle"]), math.degrees(found.noise_errors["repose_angle"])
 
 
-def _after(scene: Scene, before: np.ndarray, stroke: np.ndarray | None, push: PushRule | None) -> Any:
+def _after(scene: Scene, before: np.ndarray, stroke: np.ndarray | None, push: PushRule | None) -> jax.Array:
     return settle(scene, before).height if stroke is None else step(scene, before, stroke, push=push).height
 
 

@@ -6,13 +6,13 @@ The counterpart of "order of complexity" in arXiv:1908.02745, and the maps that 
 import string
 import time
 from functools import partial
-from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import seconds_of, timed
 from jaxsand.goals import letters as goals
-from jaxsand.planning.binary import Cell, Plan, plan
+from jaxsand.planning.binary import Cell, Engine, Plan, plan
 from jaxsand.planning.binary.paper import ALPHA
 from jaxsand.scene.progress import Tell
 
@@ -28,7 +28,7 @@ PUBLISHED = {
 Map = tuple[np.ndarray, Cell | None]
 
 
-def planning(tell: Tell) -> dict[str, list[dict[str, Any]]]:
+def planning(tell: Tell) -> dict[str, list[Row]]:
     """All tables."""
     return {
         "paper_counts": rows_of_paper(tell),
@@ -92,7 +92,7 @@ def comb(teeth: int, cells: int = 28) -> Map:
     return dig, (1, 0)
 
 
-def rows_of_letters(tell: Tell) -> list[dict[str, Any]]:
+def rows_of_letters(tell: Tell) -> list[Row]:
     """Every letter by `astar` and by `exact` (best of three runs): steps, proofs, expansions, milliseconds."""
     rows = []
     for letter in string.ascii_uppercase:
@@ -116,7 +116,7 @@ def rows_of_letters(tell: Tell) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_paper(tell: Tell) -> list[dict[str, Any]]:
+def rows_of_paper(tell: Tell) -> list[Row]:
     """The paper's counts, as published and as its search gives them here, and what `astar` expands instead."""
     rows = []
     for (letter, alpha), (nodes, steps) in PUBLISHED.items():
@@ -143,7 +143,7 @@ def rows_of_paper(tell: Tell) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_alpha(tell: Tell) -> list[dict[str, Any]]:
+def rows_of_alpha(tell: Tell) -> list[Row]:
     """The paper's search at falling alpha: nodes against steps in excess of the fewest."""
     rows = []
     for letter in "ASTR":
@@ -156,7 +156,7 @@ def rows_of_alpha(tell: Tell) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_size(tell: Tell, bound: int = 300_000) -> list[dict[str, Any]]:
+def rows_of_size(tell: Tell, bound: int = 300_000) -> list[Row]:
     """Nodes and time against the number of back-tracks (combs of 28 cells) and against the map's size (stretched letters);
     a search that gave up after `bound` expansions has no count."""
     maps = [(f"comb, {teeth} teeth", teeth, comb(teeth)) for teeth in range(1, 8)]
@@ -164,7 +164,7 @@ def rows_of_size(tell: Tell, bound: int = 300_000) -> list[dict[str, Any]]:
     rows = []
     for name, x, (dig, start) in maps:
         tell(name)
-        row: dict[str, Any] = {"name": name, "x": x, "cells": int(dig.sum()), "steps": None}
+        row: Row = {"name": name, "x": x, "cells": int(dig.sum()), "steps": None}
         for engine in ("paper", "astar", "exact"):
             began = time.perf_counter()
             found = plan(dig, start, engine=engine, bound=None if engine == "exact" else bound)
@@ -176,7 +176,7 @@ def rows_of_size(tell: Tell, bound: int = 300_000) -> list[dict[str, Any]]:
     return rows
 
 
-def rows_of_hard(tell: Tell, seconds: float = 10.0) -> list[dict[str, Any]]:
+def rows_of_hard(tell: Tell, seconds: float = 10.0) -> list[Row]:
     """Larger maps within some seconds each: cells, steps, gap, seconds; sets of maps by their worst member."""
     letters = string.ascii_uppercase
     sets: dict[str, list[Map]] = {
@@ -209,6 +209,6 @@ def rows_of_hard(tell: Tell, seconds: float = 10.0) -> list[dict[str, Any]]:
     return rows
 
 
-def _timed(dig: np.ndarray, start: Cell | None, engine: Any) -> tuple[Plan, float]:
+def _timed(dig: np.ndarray, start: Cell | None, engine: Engine) -> tuple[Plan, float]:
     took = timed(partial(plan, dig, start, engine=engine), 2)
     return took.result, 1e3 * min(took.first, took.best)

@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import race, timed
 from jaxsand.envs import Heights, LevelGoals, OnSand, Together, Walks, make, pool_of
 from jaxsand.interaction.blade_closed_form import SwathPush
@@ -25,7 +26,6 @@ from jaxsand.relaxation.stopping import Sweeps, UntilStill
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.window import AsNeeded, Whole
 
-Row = dict[str, Any]
 KINDS = "full push", "push with heights", "dig", "fast push", "walk on a map", "walk on sand"
 _FULL, _RISING, _DIG, _FAST, _MAP, _SAND = KINDS
 _VMAP, _SHARED, _LOOP = "vmap", ", a share to each device", "Gymnasium, one by one"
@@ -85,11 +85,11 @@ def bench_env(batch: int = 1024, tell: Tell = quiet, kinds: tuple[str, ...] = KI
     return rows
 
 
-def _made(kind: str) -> tuple[tuple[Any, Any], dict[str, Any]]:
+def _made(kind: str) -> tuple[tuple[Any, Any], Row]:
     """The environment of a kind with its parameters, and the options that make it."""
     level = LevelGoals(jnp.zeros((1, 32, 32), jnp.float32))
     if kind in (_FULL, _RISING, _DIG, _FAST):
-        more: dict[str, Any] = {_RISING: {"heights": Heights()}, _FAST: {"push": SwathPush()}}
+        more: Row = {_RISING: {"heights": Heights()}, _FAST: {"push": SwathPush()}}
         options = {"goals": level} | more.get(kind, {})
         return make("excavate" if kind == _DIG else "multi-stroke", **options), options
     options = {"goals": pool_of(Walks(), jax.random.key(0), 256)} | ({"on": OnSand()} if kind == _SAND else {})
@@ -146,13 +146,13 @@ def _error(loose: Any, env: Any, params: Any) -> float:
     return float(jnp.abs(ends[0] - ends[1]).mean() / jnp.abs(ends[1]).mean())
 
 
-def _gymnasium(kind: str, options: dict[str, Any]) -> list[Contender]:
+def _gymnasium(kind: str, options: Row) -> list[Contender]:
     """A single environment, step by step, as an agent's loop has it; nothing without Gymnasium."""
     try:
         from jaxsand.envs.gymnasium import ExcavateEnv, MultiStrokeEnv, SingleStrokeEnv
     except ImportError:
         return []
-    entries: dict[str, Any] = {_DIG: ExcavateEnv, _MAP: SingleStrokeEnv, _SAND: SingleStrokeEnv}
+    entries: Row = {_DIG: ExcavateEnv, _MAP: SingleStrokeEnv, _SAND: SingleStrokeEnv}
     env = entries.get(kind, MultiStrokeEnv)(**options)
     env.action_space.seed(0)
     env.reset(seed=0)

@@ -2,10 +2,11 @@
 
 import heapq
 from functools import partial
-from typing import Any
 
+import jax
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import timed
 from jaxsand.goals.letters import letter_map
 from jaxsand.planning.binary.frontier import Bound, layered, misdug, two_colours
@@ -13,7 +14,7 @@ from jaxsand.planning.binary.graph import Graph, goal_only, with_margin
 from jaxsand.scene.progress import Tell
 
 
-def rows_of_expansions(tell: Tell, repeats: int = 5) -> list[dict[str, Any]]:
+def rows_of_expansions(tell: Tell, repeats: int = 5) -> list[Row]:
     """The paper's letters with a margin, and wide maps over their goal cells only: medians of some runs each.
 
     The heap runs the same bound, first in first out among equals.
@@ -102,5 +103,5 @@ def heap_two_colours(graph: Graph) -> tuple[int, int]:
             heapq.heappush(queue, (g + h, order, g, j, rest))
 
 
-def _bits(words: np.ndarray) -> int:
+def _bits(words: np.ndarray | jax.Array) -> int:
     return sum(int(word) << (32 * i) for i, word in enumerate(words))

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsand.interaction.bucket import dump, load_volume, scoop
 from jaxsand.interaction.simulate import act, step
-from jaxsand.relaxation.settling import settle
+from jaxsand.relaxation.settling import Settled, settle
 from jaxsand.relaxation.stopping import Stop, Sweeps
 from jaxsand.scene.boundaries import Base, Deep
 from jaxsand.scene.grid import Neighbours
@@ -19,7 +19,7 @@ from jaxsand.scene.scene import Scene, cast, make_scene
 from jaxsand.scene.tools import Blade, Bucket, Tool, Wheel
 from jaxsand.scene.window import Window
 
-Inputs = tuple[Any, Any, Any]
+Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Heights [B, H, W] (m), strokes [B, 4] or [B, 6] (m) and angles of repose [B] (rad)."""
 
 SPACING = 0.01
@@ -32,7 +32,7 @@ _UNITS = (SPACING, SPACING, 1.0)
 
 
 @dataclass(frozen=True)
-class Case:
+class GradientCase:
     """A program whose gradient is wanted: settling, or a push by a tool and settling; of a bucket, a scoop and a dump.
 
     `rises`: strokes have heights. `base`: what lies under the sand.
@@ -70,16 +70,18 @@ class Case:
         return way + (", at an angle" if yaw is not None else "") + (", plates" if plates is not None else "")
 
 
-def program(case: Case, cells: int) -> Callable[..., Any]:
+def program(case: GradientCase, cells: int) -> Callable[..., Any]:
     """From a height [H, W], stroke, angle, and perhaps a stop rule: a weighted sum of the map that is left, and the sweeps
     that settling took."""
     weights = np.random.default_rng(9).standard_normal((cells, cells))
 
-    def run(height: Any, stroke: Any, angle: Any, stop: Stop | None = case.stop) -> tuple[Any, Any]:
+    def run(
+        height: jax.Array, stroke: jax.Array, angle: jax.Array, stop: Stop | None = case.stop
+    ) -> tuple[jax.Array, jax.Array]:
         of: Any = {"neighbours": case.neighbours}
         if case.pushes:
             scene = make_scene((cells, cells), SPACING, angle, tool=case.tool, window=case.window, base=case.base, **of)
-            after: Any = _worked(scene, height, stroke, stop)
+            after = _worked(scene, height, stroke, stop)
         else:
             after = settle(make_scene((cells, cells), SPACING, angle, **of), height, stop=stop, window=case.window)
         return jnp.sum(jnp.asarray(weights, after.height.dtype) * after.height), after.sweeps
@@ -87,7 +89,7 @@ def program(case: Case, cells: int) -> Callable[..., Any]:
     return run
 
 
-def _worked(scene: Scene, height: Any, stroke: Any, stop: Stop | None) -> Any:
+def _worked(scene: Scene, height: jax.Array, stroke: jax.Array, stop: Stop | None) -> Settled:
     """A push; of a bucket a scoop, and a dump of 0.6 of what it took up where the scoop ended."""
     if not isinstance(scene.tool, Bucket):
         return step(scene, height, stroke, stop=stop)
@@ -107,7 +109,7 @@ def sloped(run: Callable[..., Any]) -> Callable[..., Any]:
     return jax.value_and_grad(run, (0, 1, 2), has_aux=True)
 
 
-def inputs(case: Case, cells: int, batch: int, seed: int = 0) -> Inputs:
+def inputs(case: GradientCase, cells: int, batch: int, seed: int = 0) -> Inputs:
     """Random strokes, in a square of 0.2 m in the middle of the map, on gentle dunes; where the case does not push, the
     maps that the blade has just left. In float64."""
     rng = np.random.default_rng(seed)
@@ -131,7 +133,7 @@ def _pushed(heights: np.ndarray, strokes: np.ndarray, angles: np.ndarray) -> np.
 
 
 def against_differences(
-    case: Case, points: int = 64, seed: int = 0, cells: int = 32, chunk: int | None = None
+    case: GradientCase, points: int = 64, seed: int = 0, cells: int = 32, chunk: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors [3, P] of the gradient by each input against central differences at random points, in float64 and over the
     gradient's norm; and which of these points are smooth [3, P].
@@ -150,7 +152,7 @@ def against_differences(
     return error, smooth
 
 
-def _differences(case: Case, cells: int, batch: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _differences(case: GradientCase, cells: int, batch: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng, given = np.random.default_rng(seed), inputs(case, cells, batch, seed)
     with jax.enable_x64(True):
         x = cast(given, jnp.float64)
@@ -175,7 +177,7 @@ def _differences(case: Case, cells: int, batch: int, seed: int) -> tuple[np.ndar
     return np.array(error), np.array(smooth)
 
 
-def of_float32(case: Case, points: int = 64, seed: int = 0, cells: int = 32) -> np.ndarray:
+def of_float32(case: GradientCase, points: int = 64, seed: int = 0, cells: int = 32) -> np.ndarray:
     """Errors [P] of the gradient in float32 at random points, against that in float64, over its norm."""
     given = inputs(case, cells, points, seed)
     single = _gradient(case, cells)(*cast(given, jnp.float32))[1]
@@ -197,18 +199,19 @@ def relative(found: Any, right: Any) -> np.ndarray:
 
 
 @cache
-def _forward(case: Case, cells: int) -> Callable[..., Any]:
+def _forward(case: GradientCase, cells: int) -> Callable[..., Any]:
     return jax.jit(jax.vmap(program(case, cells)))
 
 
 @cache
-def _gradient(case: Case, cells: int) -> Callable[..., Any]:
+def _gradient(case: GradientCase, cells: int) -> Callable[..., Any]:
     return jax.jit(differentiated(program(case, cells)))
 
 
 @cache
 def _act_program() -> Callable[..., Any]:
-    def one(height: Any, stroke: Any, angle: Any) -> Any:
-        return act(make_scene(height.shape, SPACING, angle, tool=Blade()), height, stroke).height
+    def one(height: jax.Array, stroke: jax.Array, angle: jax.Array) -> jax.Array:
+        rows, columns = height.shape
+        return act(make_scene((rows, columns), SPACING, angle, tool=Blade()), height, stroke).height
 
     return jax.jit(jax.vmap(one))

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxsand.bench.gradient_checks import (
     SPACING,
-    Case,
+    GradientCase,
     Inputs,
     against_differences,
     differentiated,
@@ -22,6 +22,7 @@ from jaxsand.bench.gradient_checks import (
     relative,
     sloped,
 )
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import race
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.stroke_loss import GRADIENT, sand_loss
@@ -32,24 +33,23 @@ from jaxsand.scene.scene import cast, make_scene
 from jaxsand.scene.tools import Blade, Bucket, Wheel
 from jaxsand.scene.window import Window
 
-Row = dict[str, Any]
 STOPS: tuple[Stop, ...] = (*(UntilStill(t) for t in (0.1, 0.03, 0.01, 1e-3, 1e-4)), *(Sweeps(n) for n in (16, 64, 256)))
 _ROUNDS = 3
 _CACHED = 16 * 32 * 32  # cells
 CASES = (
-    *(Case(pushes, neighbours) for pushes in (False, True) for neighbours in (4, 8, "isotropic")),
-    *(Case(pushes, window=Window((16, 16))) for pushes in (False, True)),
-    Case(False, stop=Sweeps(1000)),
+    *(GradientCase(pushes, neighbours) for pushes in (False, True) for neighbours in (4, 8, "isotropic")),
+    *(GradientCase(pushes, window=Window((16, 16))) for pushes in (False, True)),
+    GradientCase(False, stop=Sweeps(1000)),
 )
 TOOLS = (
-    Case(True),
-    Case(True, rises=True),
-    Case(True, tool=Blade(yaw=0.5)),
-    Case(True, tool=Blade(plates=0.03)),
-    Case(True, tool=Wheel(0.04, 0.03, 0.01)),
-    Case(True, tool=Wheel(0.04, 0.03, 0.01), rises=True),
-    Case(True, tool=Bucket(0.04, 0.04, 4e-4), rises=True),
-    Case(True, tool=Blade(depth=0.015), base=Base(-0.01)),
+    GradientCase(True),
+    GradientCase(True, rises=True),
+    GradientCase(True, tool=Blade(yaw=0.5)),
+    GradientCase(True, tool=Blade(plates=0.03)),
+    GradientCase(True, tool=Wheel(0.04, 0.03, 0.01)),
+    GradientCase(True, tool=Wheel(0.04, 0.03, 0.01), rises=True),
+    GradientCase(True, tool=Bucket(0.04, 0.04, 4e-4), rises=True),
+    GradientCase(True, tool=Blade(depth=0.015), base=Base(-0.01)),
 )
 """Each tool, and what it can do; blades and wheels at one height, and rising or sinking."""
 
@@ -57,19 +57,19 @@ TOOLS = (
 def bench_grad(
     tell: Tell = quiet,
     larger: int | None = None,
-    cases: tuple[Case, ...] = CASES,
+    cases: tuple[GradientCase, ...] = CASES,
     stops: tuple[Stop, ...] = STOPS,
     plans: tuple[int, ...] = (4, 16, 64),
     cells: int = 32,
     batch: int = 64,
     rounds: int = _ROUNDS,
-    tools: tuple[Case, ...] = TOOLS,
+    tools: tuple[GradientCase, ...] = TOOLS,
 ) -> dict[str, list[Row]]:
     """Costs, errors (of every tool too), errors against run time when settling stops early, and what strokeloss.GRADIENT
     stands for, on `batch` maps of `cells` a side. With `larger`, costs also on so many of these, and on a 64th as many of
     160 x 160."""
     sizes = ((cells, batch),) + (((cells, larger), (160, max(1, larger // 64))) if larger else ())
-    early = tuple(case for case in cases if case in (Case(False), Case(True)))
+    early = tuple(case for case in cases if case in (GradientCase(False), GradientCase(True)))
     return {
         "gradient_cost": costs(tell, cases, sizes, rounds),
         "gradient_of_plans": multiples(tell, plans, cells=cells, rounds=rounds),
@@ -79,7 +79,9 @@ def bench_grad(
     }
 
 
-def costs(tell: Tell, cases: tuple[Case, ...], sizes: tuple[tuple[int, int], ...], rounds: int = _ROUNDS) -> list[Row]:
+def costs(
+    tell: Tell, cases: tuple[GradientCase, ...], sizes: tuple[tuple[int, int], ...], rounds: int = _ROUNDS
+) -> list[Row]:
     """Run times of the gradient and of the forward run (best of a few, in turns) for maps of so many cells a side, in
     batches of so many, float32, as many at a time as have 16,384 cells together, so that they stay in a core's cache. And
     the memory that the gradient needs beyond the forward run's, in bytes for each cell of the maps that run together, and
@@ -128,7 +130,7 @@ def _compiled(run: Callable[..., Any], x: Inputs) -> tuple[Any, float, int]:
     return compiled, time.perf_counter() - began, getattr(compiled.memory_analysis(), "temp_size_in_bytes", 0)
 
 
-def _sweeps(case: Case, cells: int, strokes: np.ndarray, settling: int) -> tuple[int, int]:
+def _sweeps(case: GradientCase, cells: int, strokes: np.ndarray, settling: int) -> tuple[int, int]:
     """Sweeps of the slowest map, and the largest number that the rules allow; those of a push included."""
     stop = UntilStill() if case.stop is None else case.stop
     taken, allowed = settling, stop.count if isinstance(stop, Sweeps) else stop.bound
@@ -140,7 +142,7 @@ def _sweeps(case: Case, cells: int, strokes: np.ndarray, settling: int) -> tuple
     return taken, allowed
 
 
-def accuracy(tell: Tell, cases: tuple[Case, ...], points: int, cells: int) -> list[Row]:
+def accuracy(tell: Tell, cases: tuple[GradientCase, ...], points: int, cells: int) -> list[Row]:
     """Errors over the gradient's norm: of float64 by each input against central differences where the points are smooth (see
     gradient_checks.py), of which `smooth` is the share, and of float32 against float64."""
     rows = []
@@ -158,7 +160,7 @@ def accuracy(tell: Tell, cases: tuple[Case, ...], points: int, cells: int) -> li
 
 
 def stopped_early(
-    tell: Tell, cases: tuple[Case, ...], stops: tuple[Stop, ...], cells: int, batch: int, rounds: int = _ROUNDS
+    tell: Tell, cases: tuple[GradientCase, ...], stops: tuple[Stop, ...], cells: int, batch: int, rounds: int = _ROUNDS
 ) -> list[Row]:
     """Run times of the gradient in float32 when settling stops early, and its error over its norm, against that in float64
     with a tolerance of 1e-5."""

@@ -1,14 +1,14 @@
 """Every letter, shaped: how close the sand comes to it."""
 
 import string
-from typing import Any
 
+from jaxsand.bench.tables import Row
 from jaxsand.goals import letters
 from jaxsand.planning.pipeline import Layout, glyph_target, map_target, shape
 from jaxsand.scene.progress import Tell, quiet
 
 
-def bench_letters(tell: Tell = quiet) -> list[dict[str, Any]]:
+def bench_letters(tell: Tell = quiet) -> list[Row]:
     """Every letter by the plan of its map, and by its own strokes.
 
     A letter pushed by its own strokes is its own goal, so that row checks the plumbing.

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.work_precision import MU, roof
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
@@ -76,10 +77,10 @@ def table(n: int, neighbours: Neighbours = "isotropic") -> float:
     return float(np.abs(np.asarray(s.height) - exact).sum() / exact.sum())
 
 
-def piles(tell: Tell = quiet, sizes: int = 4) -> list[dict[str, Any]]:
+def piles(tell: Tell = quiet, sizes: int = 4) -> list[Row]:
     """L1 errors against exact piles by the number of cells a side, and the order in which they fall, in float64; for a cone
     also the least and the largest angle of its flank (degrees, repose is 29)."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     with jax.enable_x64(True):
         ways: tuple[Neighbours, ...] = (4, 8, "isotropic")
         for neighbours in ways:

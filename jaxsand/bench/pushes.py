@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import race
 from jaxsand.goals.surfaces import rough_surface
 from jaxsand.goals.usual import usual_scene
@@ -81,14 +82,14 @@ def surfaces(scene: Scene, batch: int) -> dict[str, np.ndarray]:
     }
 
 
-def push_precision(batch: int = 16, tell: Tell = quiet) -> list[dict[str, Any]]:
+def push_precision(batch: int = 16, tell: Tell = quiet) -> list[Row]:
     """Random pushes of the default blade on 32 x 32 cells, by sub-step and sweeps, on `surfaces`.
 
     `error` is the mean distance from the limit over the mean change that the limit makes, after settling; `worst` the same
     of the worst map; `dug_error` and `berm_error` compare the volume below and the height above the start. The rows named
     "limit" say how uncertain that is. `fitted_order` is that of the sub-step s where 1 / s sweeps follow each.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     with jax.enable_x64(True):
         scene = usual_scene()
         strokes = np.tile(np.asarray(random_strokes(batch), float), (3, 1))
@@ -117,7 +118,7 @@ def push_precision(batch: int = 16, tell: Tell = quiet) -> list[dict[str, Any]]:
     return [row | {"fitted_order": order} for row in rows]
 
 
-def push_speed(batch: int, tell: Tell = quiet) -> list[dict[str, Any]]:
+def push_speed(batch: int, tell: Tell = quiet) -> list[Row]:
     """Random pushes of the default blade on level sand of 32 x 32 cells: pushes a second, the ways taking turns."""
     scene = usual_scene()
     level, strokes = jnp.zeros((batch, 32, 32), jnp.float32), random_strokes(batch)
@@ -153,7 +154,7 @@ def _square(height: jax.Array) -> jax.Array:
     return jnp.sum(height**2)
 
 
-def push_against_spacing(tell: Tell = quiet, batch: int = 8) -> list[dict[str, Any]]:
+def push_against_spacing(tell: Tell = quiet, batch: int = 8) -> list[Row]:
     """The same pushes of a blade of 60 x 30 mm, 20 mm deep, on finer grids, averaged over the cells of the coarsest, against
     the finest; with the fitted order."""
     maps = {}
@@ -169,7 +170,7 @@ def push_against_spacing(tell: Tell = quiet, batch: int = 8) -> list[dict[str, A
     return [{"cells": n, "error": e, "fitted_order": order} for n, e in zip(sides, errors, strict=True)]
 
 
-def push_by_heading(tell: Tell = quiet) -> list[dict[str, Any]]:
+def push_by_heading(tell: Tell = quiet) -> list[Row]:
     """One stroke of 12 cm from 0 to 45 degrees on isotropic level sand, each the mean of eight sub-cell places: the heap's
     height before the blade is lifted and the volume dug in the end, as shares of their means over the headings."""
     rows = []
@@ -191,7 +192,7 @@ def push_by_heading(tell: Tell = quiet) -> list[dict[str, Any]]:
     return rows
 
 
-def push_continuity(many: int = 1024, tell: Tell = quiet) -> list[dict[str, Any]]:
+def push_continuity(many: int = 1024, tell: Tell = quiet) -> list[Row]:
     """How far what a stroke leaves moves with the stroke: the largest change of a height over that of the stroke, as
     quantiles over random strokes in float64."""
     with jax.enable_x64(True):
@@ -215,7 +216,7 @@ def push_continuity(many: int = 1024, tell: Tell = quiet) -> list[dict[str, Any]
     return rows
 
 
-def long_path(sides: tuple[int, ...] = (64, 4096), legs: int = 100, tell: Tell = quiet) -> list[dict[str, Any]]:
+def long_path(sides: tuple[int, ...] = (64, 4096), legs: int = 100, tell: Tell = quiet) -> list[Row]:
     """A path of many short legs in the middle of maps of any size, beside one copy of the map."""
     rows = []
     for n in sides:
@@ -231,7 +232,7 @@ def long_path(sides: tuple[int, ...] = (64, 4096), legs: int = 100, tell: Tell =
     return rows
 
 
-def in_parts(tell: Tell = quiet) -> list[dict[str, Any]]:
+def in_parts(tell: Tell = quiet) -> list[Row]:
     """How far a path in many legs is from the same path in one, over what that changes: a line of 16 cm askew to the cells
     by the default blade, and half a turn of a blade of 10 cells all but in place."""
     rows = []
@@ -271,7 +272,7 @@ def heaps(
     push: SteppedPush | None = None,
     tell: Tell = quiet,
     neighbours: Neighbours = 8,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """The heap ahead of a blade as wide as its bed, against the triangle: 20 mm thick, 12 mm deep, 16 cm far, 31 degrees.
 
     `error` is the distance from the triangle's cell means, in the cells wholly ahead of the face, over its volume; `peak`
@@ -293,7 +294,7 @@ def heap(
     angle: float = math.radians(31),
     thickness: float = 0.02,
     neighbours: Neighbours = 8,
-) -> dict[str, Any]:
+) -> Row:
     """One heap (lengths in m): V = depth (way + thickness / 2) to a unit of width, peak sqrt(2 mu V), toe sqrt(2 V / mu)."""
     mu = math.tan(angle)
     volume = depth * (way + thickness / 2)

@@ -2,10 +2,10 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.goals.goal import Goal
 from jaxsand.goals.surfaces import rested, rough_surface
 from jaxsand.planning.gradient import optimise_strokes
@@ -16,6 +16,7 @@ from jaxsand.scene.grid import places
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
+from jaxsand.viz.side import Side
 
 _SHAPE, _SPACING = (16, 32), 0.02
 _START, _END, _SIDES = 0.18, 0.48, (0.08, 0.24)  # of the ramp and the pad (m)
@@ -80,7 +81,7 @@ def bench_ramps(
     per_stroke: int = 200,
     steps: int = 30,
     seed: int = 0,
-) -> dict[str, list[dict[str, Any]]]:
+) -> dict[str, list[Row]]:
     """Each kind of strokes on each piece of earth: by search, and rising ones then by gradients.
 
     Errors are means of |height - goal| in mm, where the goal counts. A search has `per_stroke` pushes to each stroke, and
@@ -100,8 +101,8 @@ def bench_ramps(
     return {"ramp": rows, "ramp_maps": maps}
 
 
-def shown(maps: list[dict[str, Any]]) -> list[tuple[str, Scene, dict[str, np.ndarray], np.ndarray]]:
-    """Of each piece of earth that `bench_ramps` tells of: its name, scene, maps by name, and the way up its middle (m)."""
+def shown(maps: list[Row]) -> list[Side]:
+    """Each piece of earth that `bench_ramps` tells of, with its maps along the way up its middle."""
     known = {work.name: work for work in works()}
     y = sum(_SIDES) / 2
     found = []
@@ -111,11 +112,11 @@ def shown(maps: list[dict[str, Any]]) -> list[tuple[str, Scene, dict[str, np.nda
         middle = np.nanmin(work.goal), np.nanmax(work.goal)
         rise = (middle[1] - middle[0]) / (_END - _START - _SPACING)
         ends = ((x, y, float(np.nanmean(work.goal)) + rise * (x - (_START + _END) / 2)) for x in (_START, _END))
-        found.append((work.name, work.scene, some, np.array([*ends])))
+        found.append(Side(work.name, work.scene, some, np.array([*ends])))
     return found
 
 
-def _row(work: Work, kind: str, size: tuple[int, int, int], seed: int, tell: Tell) -> tuple[dict[str, Any], np.ndarray]:
+def _row(work: Work, kind: str, size: tuple[int, int, int], seed: int, tell: Tell) -> tuple[Row, np.ndarray]:
     """The row of one kind of strokes, with so many strokes, pushes for each, and steps of gradients; and what they leave."""
     kinds: dict[str, Actions] = {
         "one depth": Flat(lowest=-work.depth, highest=-work.depth),

@@ -36,7 +36,7 @@ from jaxsand.bench import (
 from jaxsand.bench import strokes as strokebench
 from jaxsand.bench.letters import bench_letters
 from jaxsand.bench.rivals.plain import compile_c, settle_numpy
-from jaxsand.bench.tables import as_table
+from jaxsand.bench.tables import Row, as_table
 from jaxsand.bench.timing import race
 from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.simulate import act
@@ -62,7 +62,7 @@ def bench(
     grids: int = 3,
     seed: int = 0,
     **strokes: Any,
-) -> dict[str, Any]:
+) -> Row:
     """The figures for `what`: settle, push, plan, or all of these; env, grad, calibrate, sand, strokes, trench,
     stability, letters, ramp, or tasks.
 
@@ -71,7 +71,7 @@ def bench(
     `tasks.bench_tasks`.
     """
     larger, batch = batch, batch or {"grad": 64, "env": 1024}.get(what, 4096)
-    report: dict[str, Any] = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
+    report: Row = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
         report["chunks"] = analysis.chunks(*_pushed(batch), tell)
@@ -125,7 +125,7 @@ def bench(
 
 
 @dataclass(frozen=True)
-class Way:
+class Settler:
     """One way to do the job: `call` returns the sweeps of each of its `maps` (or None) and some of the maps it made."""
 
     call: Callable[[], tuple[Any, Any]]
@@ -133,7 +133,7 @@ class Way:
     cores: int = 1
 
 
-def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 64) -> list[dict[str, Any]]:
+def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 64) -> list[Row]:
     """Settling maps in which a random push has just ended.
 
     `error` is the largest distance, over the first maps, of the settled map from the limit of small steps (float64, rate
@@ -154,20 +154,24 @@ def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 
         return np.array(sweeps), np.stack(maps)
 
     ways = {
-        "settle_batch": Way(lambda: ours(settle_batch(scene, heights)), batch, count),
-        "settle_batch, tolerance 1e-2": Way(lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, count),
-        "settle_batch, growth 0.8": Way(
+        "settle_batch": Settler(lambda: ours(settle_batch(scene, heights)), batch, count),
+        "settle_batch, tolerance 1e-2": Settler(
+            lambda: ours(settle_batch(scene, heights, stop=UntilStill(1e-2))), batch, count
+        ),
+        "settle_batch, growth 0.8": Settler(
             lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8))), batch, count
         ),
-        "settle_batch, growth 0.8, first 1/16": Way(
+        "settle_batch, growth 0.8, first 1/16": Settler(
             lambda: ours(settle_batch(scene, heights, scheme=SuperTimeStepping(0.8, 1 / 16))), batch, count
         ),
-        "settle_batch, paper's sweep": Way(lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, count),
-        f"settle_batch, {fixed} of the paper's sweeps": Way(
+        "settle_batch, paper's sweep": Settler(
+            lambda: ours(settle_batch(scene, heights, scheme=Relaxation())), batch, count
+        ),
+        f"settle_batch, {fixed} of the paper's sweeps": Settler(
             lambda: ours(settle_batch(scene, heights, scheme=Relaxation(), stop=Sweeps(fixed))), batch, count
         ),
-        "vmap(settle)": Way(lambda: ours(vmapped(heights)), batch, count),
-        _NUMPY: Way(plain, sample),
+        "vmap(settle)": Settler(lambda: ours(vmapped(heights)), batch, count),
+        _NUMPY: Settler(plain, sample),
     }
     settle_c = compile_c()
     if settle_c is not None:
@@ -179,10 +183,10 @@ def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 
                 sweeps = np.concatenate(list(pool.map(lambda part: c(part, _SPACING, mu, **rule), parts)))
             return sweeps, np.concatenate(parts)[:sample]
 
-        ways[_C] = Way(lambda: threads(1), batch)
-        ways[f"C loop, {fixed} sweeps"] = Way(lambda: threads(1, tolerance=-1.0, bound=fixed), batch)
+        ways[_C] = Settler(lambda: threads(1), batch)
+        ways[f"C loop, {fixed} sweeps"] = Settler(lambda: threads(1, tolerance=-1.0, bound=fixed), batch)
         if count > 1:
-            ways[f"C loop, {count} cores"] = Way(lambda: threads(count), batch, count)
+            ways[f"C loop, {count} cores"] = Settler(lambda: threads(count), batch, count)
     small = partial(settle_numpy, rate=1 / 64, tolerance=1e-6)
     limit = np.stack([small(h.astype(float), _SPACING, mu)[0] for h in host[:sample]])
     largest = np.abs(limit - host[:sample]).max()
@@ -207,7 +211,7 @@ def bench_settle(batch: int, tell: Tell = quiet, sample: int = 16, fixed: int = 
     return rows
 
 
-def table(report: dict[str, Any]) -> str:
+def table(report: Row) -> str:
     """The report as text."""
     lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
     for what, rows in report.items():
@@ -216,7 +220,7 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _compare(rows: list[dict[str, Any]], rival: str, figure: str, name: str, *, inverse: bool = False) -> None:
+def _compare(rows: list[Row], rival: str, figure: str, name: str, *, inverse: bool = False) -> None:
     """Adds to every row how many times better its figure is than the rival's."""
     base = next((row[figure] for row in rows if row["name"] == rival), None)
     if base is not None:

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxsand.bench.rivals import search
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import race
 from jaxsand.goals.goal import as_goal
 from jaxsand.interaction.simulate import step
@@ -34,9 +35,7 @@ _STEPS: dict[str, Callable[..., Any]] = {
 _SEARCH, _ALONE = "search", "layers alone"
 
 
-def bench_sand(
-    tell: Tell = quiet, per_stroke: int = 1000, names: tuple[str, ...] = (), seed: int = 0
-) -> list[dict[str, Any]]:
+def bench_sand(tell: Tell = quiet, per_stroke: int = 1000, names: tuple[str, ...] = (), seed: int = 0) -> list[Row]:
     """Every method on every task, at `per_stroke` full pushes to each stroke or leg that a plan may have.
 
     Distances are l2 in mm, of what `follow` makes of the plan. `closer` says by how much closer to the goal the search ends
@@ -48,7 +47,7 @@ def bench_sand(
     return rows
 
 
-def children_per_second(batch: int = 256, alone: int = 32, seed: int = 0) -> list[dict[str, Any]]:
+def children_per_second(batch: int = 256, alone: int = 32, seed: int = 0) -> list[Row]:
     """Children of one node: in batches, in full and roughly, and by the same push one at a time in a Python loop."""
     chosen = sand_task("crossing")
     scene, level = chosen.scene, chosen.height
@@ -75,7 +74,7 @@ def children_per_second(batch: int = 256, alone: int = 32, seed: int = 0) -> lis
     ]
 
 
-def _on_task(chosen: SandTask, tell: Tell, per_stroke: int, seed: int) -> list[dict[str, Any]]:
+def _on_task(chosen: SandTask, tell: Tell, per_stroke: int, seed: int) -> list[Row]:
     scene, height, goal = chosen.scene, chosen.height, as_goal(chosen.scene, chosen.goal)
     job, budget = Job(scene, height, goal, chosen.strokes, chosen.actions), per_stroke * chosen.strokes
     before = float(distance(height, goal))

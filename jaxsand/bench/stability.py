@@ -4,12 +4,12 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.goals.metrics import volume_error
 from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.simulate import rollout
@@ -32,13 +32,13 @@ _SCHEMES = (SuperTimeStepping(), Multilevel(), Relaxation(), Pairwise())
 
 
 @dataclass(frozen=True)
-class Case:
+class SettlingCase:
     """A map [H, W] (m) to settle, and what bounds it. Angles in radians."""
 
     name: str
     height: np.ndarray
     scheme: Scheme
-    angle: Any = _ANGLE
+    angle: float | np.ndarray = _ANGLE
     spacing: float = _DX
     neighbours: Neighbours = 8
     solid: np.ndarray | None = None
@@ -59,9 +59,9 @@ class Case:
         return min(1e-3, math.tan(np.min(self.angle)) / 10)
 
 
-def cases(largest: int = 1024) -> Iterator[Case]:
+def cases(largest: int = 1024) -> Iterator[SettlingCase]:
     """One axis at a time away from a rough map of 31 x 17 cells, which walls and coarser grids do not divide evenly."""
-    rough = Case("rough", _rough(_SHAPE, 5 * _DX), SuperTimeStepping())
+    rough = SettlingCase("rough", _rough(_SHAPE, 5 * _DX), SuperTimeStepping())
     for scheme in _SCHEMES:
         base = replace(rough, scheme=scheme)
         for angle in (0.01, 1, 29, 60, 89.9):
@@ -85,7 +85,7 @@ def cases(largest: int = 1024) -> Iterator[Case]:
     yield replace(rough, name="neighbours isotropic", neighbours="isotropic", dtypes=("float16",))
 
 
-def _reliefs(base: Case) -> Iterator[Case]:
+def _reliefs(base: SettlingCase) -> Iterator[SettlingCase]:
     rows, columns = _SHAPE
     spike = np.zeros(_SHAPE)
     spike[rows // 2, columns // 3] = 1e6 * _DX
@@ -97,7 +97,7 @@ def _reliefs(base: Case) -> Iterator[Case]:
     yield replace(base, name="offset of 1e4 reliefs", height=base.height + 1e4 * np.ptp(base.height))
 
 
-def _structures(base: Case) -> Iterator[Case]:
+def _structures(base: SettlingCase) -> Iterator[SettlingCase]:
     random = np.random.default_rng(1)
     walls = random.random(_SHAPE) < 0.3
     fours, isotropic = replace(base, neighbours=4), replace(base, neighbours="isotropic")
@@ -115,8 +115,8 @@ def _structures(base: Case) -> Iterator[Case]:
 
 
 def stability(
-    largest: int = 1024, pushes: int = 100_000, tell: Tell = quiet, only: Callable[[Case], bool] = lambda _: True
-) -> list[dict[str, Any]]:
+    largest: int = 1024, pushes: int = 100_000, tell: Tell = quiet, only: Callable[[SettlingCase], bool] = lambda _: True
+) -> list[Row]:
     """One row for each case and dtype, and one for `pushes` random pushes in a row (none for 0). `only` picks cases.
 
     `residual` is the largest slope in excess of repose, `rounding` the slope that one quantum of the largest height makes
@@ -134,7 +134,7 @@ def stability(
     return rows
 
 
-def _row(case: Case, dtype: str) -> dict[str, Any]:
+def _row(case: SettlingCase, dtype: str) -> Row:
     height = case.height.astype(dtype)
     others = True
     began = time.perf_counter()
@@ -178,7 +178,7 @@ def _row(case: Case, dtype: str) -> dict[str, Any]:
     return {**which, **figures, "sweeps": sweeps, "seconds": seconds, "right": right}
 
 
-def _with_a_bad_map(case: Case, height: np.ndarray) -> tuple[np.ndarray, Settled, bool]:
+def _with_a_bad_map(case: SettlingCase, height: np.ndarray) -> tuple[np.ndarray, Settled, bool]:
     """A map with a NaN between two others, before and after, and whether those are clean and what they are without it."""
     scene = make_scene(_SHAPE, case.spacing, case.angle, case.neighbours)
     good = np.stack([height, height, -height])
@@ -189,7 +189,7 @@ def _with_a_bad_map(case: Case, height: np.ndarray) -> tuple[np.ndarray, Settled
     return bad[1], jax.tree.map(lambda leaf: leaf[1], b), same and not np.any(b.outcome[np.array([0, 2])])
 
 
-def _residual(case: Case, h: np.ndarray, mu: np.ndarray) -> float:
+def _residual(case: SettlingCase, h: np.ndarray, mu: np.ndarray) -> float:
     """The largest slope in excess of repose, NaN being no sand."""
     rows, columns = h.shape
     wide, mus = np.pad(h, 1, constant_values=np.nan), np.pad(np.broadcast_to(mu, h.shape), 1, mode="edge")
@@ -221,7 +221,7 @@ def _column(side: int) -> np.ndarray:
     return np.where(x[:, None] ** 2 + x**2 <= (side / 4) ** 2, side / 4 * _DX, 0)
 
 
-def _pushing(pushes: int, tell: Tell, at_once: int = 1000) -> dict[str, Any]:
+def _pushing(pushes: int, tell: Tell, at_once: int = 1000) -> Row:
     """Random pushes of the default blade from anywhere to anywhere on 32 x 32 cells, at first level, in float32."""
     began = time.perf_counter()
     scene = usual_scene()

@@ -9,36 +9,36 @@ from typing import Any
 
 import numpy as np
 
-from jaxsand.bench.rivals.strokes import RIVALS, Found
+from jaxsand.bench.rivals.strokes import RIVALS, BestFound
 from jaxsand.bench.stroke_goals import GOALS, StrokeGoal
+from jaxsand.bench.tables import Row
 from jaxsand.planning.gradient import first, print_of, search
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import reordered
 from jaxsand.planning.stroke_loss import Best, SandLoss
 from jaxsand.scene.progress import Tell, quiet
 
-Row = dict[str, Any]
-Method = Callable[[SandLoss, int, np.ndarray, int, int], Found]
+Method = Callable[[SandLoss, int, np.ndarray, int, int], BestFound]
 BUDGETS = (1_000, 4_000, 16_000, 64_000)
 REACHED = 0.8
 """The IoU of dug cells from which a goal counts as reached."""
 
 
-def by_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+def by_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> BestFound:
     """What `optimise_strokes` does."""
     account = Account(sand, budget)
     search(account, n_strokes, np.random.default_rng(seed))
-    return Found(account.best.strokes, account.calls, account.history)
+    return BestFound(account.best.strokes, account.calls, account.history)
 
 
-def number_open(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+def number_open(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> BestFound:
     """What `optimise_strokes` does when it is not told how many strokes there are."""
     account = Account(sand, budget)
     search(account, None, np.random.default_rng(seed))
-    return Found(account.best.strokes, account.calls, account.history)
+    return BestFound(account.best.strokes, account.calls, account.history)
 
 
-def without_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+def without_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> BestFound:
     """From the same first guesses, orders and directions, by mutations that grow when they help and shrink when not."""
     account, rng = Account(sand, budget), np.random.default_rng(seed)
     plans = first(account, print_of(account), n_strokes, rng)
@@ -50,7 +50,7 @@ def without_gradients(sand: SandLoss, n_strokes: int, bounds: np.ndarray, budget
             account.losses(np.clip(plan + rng.normal(0, width, (16, *plan.shape)), *bounds))
             plan = account.best.strokes
             width = min(max(width * (1.3 if account.best.loss < last else 0.8), 1e-5), 2e-2)
-    return Found(account.best.strokes, account.calls, account.history)
+    return BestFound(account.best.strokes, account.calls, account.history)
 
 
 METHODS: dict[str, Method] = {

@@ -2,8 +2,11 @@
 
 from typing import Any
 
+Row = dict[str, Any]
+"""What a bench found of one case: figures, None and text by their names, and lists of such rows."""
 
-def as_table(rows: list[dict[str, Any]], title: str) -> list[str]:
+
+def as_table(rows: list[Row], title: str) -> list[str]:
     """Rows of figures as lines of text: columns that hold text in any row name the rows, and None is a dash."""
     columns = list(dict.fromkeys(n for row in rows for n in row))
     naming = [n for n in columns if any(isinstance(row.get(n), str) for row in rows)]

@@ -4,11 +4,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from jaxsand.bench.rivals import earth
+from jaxsand.bench.tables import Row
 from jaxsand.goals.feasible import at_best
 from jaxsand.goals.goal import as_goal
 from jaxsand.goals.tasks import TASKS, Task, figures, make_task
@@ -48,7 +48,7 @@ def bench_tasks(
     pushes: int = 500,
     strokes: int | None = None,
     seed: int = 0,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """A row for each task and method, with means over the instances (the worst is `worst_mm`); see `figures`.
 
     Every method may use as many strokes as the task allows, but at most `strokes`, and simulate `pushes` pushes; a gradient
@@ -83,7 +83,7 @@ def _mean(values: list[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def _one(task: Task, method: str, pushes: int, seed: int) -> dict[str, Any]:
+def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
     """The figures of a method on an instance of a task."""
     began = time.perf_counter()
     scene, plan, effort = _planned(task, method, pushes, seed)

@@ -2,12 +2,12 @@
 
 import math
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.bench.timing import timed
 from jaxsand.interaction.simulate import act
 from jaxsand.interaction.wheel_closed_form import SplitPush
@@ -31,7 +31,7 @@ _SCHEMES: dict[str, Scheme] = {
 }
 
 
-def against_spacing(tell: Tell = quiet, spacings: int = 4) -> list[dict[str, Any]]:
+def against_spacing(tell: Tell = quiet, spacings: int = 4) -> list[Row]:
     """For every rule, reference and spacing the mean figures of the five trenches of 15 mm, and the median seconds of one
     (compiled, on one of the cores). `finest` are the same rule's sections on the finest spacing."""
     known = references(_SOME)
@@ -50,7 +50,7 @@ def against_spacing(tell: Tell = quiet, spacings: int = 4) -> list[dict[str, Any
     return rows
 
 
-def settling(tell: Tell = quiet, turns: int = 5) -> list[dict[str, Any]]:
+def settling(tell: Tell = quiet, turns: int = 5) -> list[Row]:
     """The paper's case of 160 x 160 cells: a trench before the sand flows (22.5 degrees, 15 mm, cells of 2 mm) is left to
     settle. `error` is the largest distance from the limit of small steps over the largest change of height."""
     spacing, cells = 2e-3, 160

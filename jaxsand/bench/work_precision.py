@@ -10,12 +10,12 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.bench.tables import Row
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping
 from jaxsand.relaxation.settling import settle
 from jaxsand.relaxation.stopping import UntilStill
@@ -39,7 +39,7 @@ _BOUND = 400_000
 
 
 @dataclass(frozen=True)
-class Problem:
+class Collapse:
     """Sand of one spacing to a cell: `heights(n)` on n cells a side (or in a row), its angle, and the exact end if known."""
 
     name: str
@@ -92,19 +92,19 @@ def roof(n: int) -> np.ndarray:
     return MU * np.minimum(near[:, None], near[None, :])
 
 
-COLUMN = Problem("column of N/2 cells", _disc(1 / 2), (80, 160, 320))
+COLUMN = Collapse("column of N/2 cells", _disc(1 / 2), (80, 160, 320))
 STIFF = (
     COLUMN,
-    Problem("trench across", trench, (128, 256, 512)),
-    Problem("5 degrees", _disc(1 / 8), (80, 160, 320), 5.0),
+    Collapse("trench across", trench, (128, 256, 512)),
+    Collapse("5 degrees", _disc(1 / 8), (80, 160, 320), 5.0),
 )
-TABLE = Problem("overfilled table", lambda n: np.full((n, n), n / 2), (32, 64, 128), exact=roof, edge=Draining())
-ISOTROPIC = Problem("column, isotropic", _disc(1 / 2), (40, 80, 160), neighbours="isotropic")
-RIDGE = Problem("ridge, one dimension", _ridge, (64, 128, 256), exact=_ridge_settled)
+TABLE = Collapse("overfilled table", lambda n: np.full((n, n), n / 2), (32, 64, 128), exact=roof, edge=Draining())
+ISOTROPIC = Collapse("column, isotropic", _disc(1 / 2), (40, 80, 160), neighbours="isotropic")
+RIDGE = Collapse("ridge, one dimension", _ridge, (64, 128, 256), exact=_ridge_settled)
 ALL = (*STIFF, ISOTROPIC, TABLE, RIDGE)
 
 
-def work_precision(problems: tuple[Problem, ...], tell: Tell = quiet, sizes: int = 3) -> list[dict[str, Any]]:
+def work_precision(problems: tuple[Collapse, ...], tell: Tell = quiet, sizes: int = 3) -> list[Row]:
     """A row for every problem, size, scheme and tolerance: errors, sweeps, seconds, and the compile time apart."""
     rows = []
     for problem in problems:
@@ -135,7 +135,7 @@ def distance(height: np.ndarray, end: np.ndarray, start: np.ndarray) -> float:
     return float(np.abs(height - end).max() / np.abs(end - start).max())
 
 
-def reference(problem: Problem, n: int) -> np.ndarray:
+def reference(problem: Collapse, n: int) -> np.ndarray:
     """The limit of small steps, in float64."""
     with jax.enable_x64(True):
         start = jnp.asarray(problem.heights(n), jnp.float64)
@@ -143,7 +143,7 @@ def reference(problem: Problem, n: int) -> np.ndarray:
         return np.asarray(settle(problem.scene(n), start, scheme=SuperTimeStepping(0.05, 1 / 64), stop=stop).height)
 
 
-def reference_check(tell: Tell = quiet) -> list[dict[str, Any]]:
+def reference_check(tell: Tell = quiet) -> list[Row]:
     """How far the reference lies from the paper's sweep at rate 1/64, on the smallest grid of every stiff problem."""
     rows = []
     for problem in STIFF:
@@ -158,7 +158,7 @@ def reference_check(tell: Tell = quiet) -> list[dict[str, Any]]:
     return rows
 
 
-def _runs(problem: Problem, n: int, scheme: Scheme) -> list[dict[str, Any]]:
+def _runs(problem: Collapse, n: int, scheme: Scheme) -> list[Row]:
     """One run for every tolerance, in float32."""
     scene, start = problem.scene(n), jnp.asarray(problem.heights(n), jnp.float32)
     program = jax.jit(lambda h, t: settle(scene, h, scheme=scheme, stop=UntilStill(t, bound=_BOUND)))
@@ -186,10 +186,10 @@ def _runs(problem: Problem, n: int, scheme: Scheme) -> list[dict[str, Any]]:
     return rows
 
 
-def time_to(rows: list[dict[str, Any]], error: float = 0.01) -> list[dict[str, Any]]:
+def time_to(rows: list[Row], error: float = 0.01) -> list[Row]:
     """For every problem, size and scheme the time to within the error, by the loosest tolerance from which on all are, and
     how that compares with the paper's sweep; None where the tightest is not."""
-    found: dict[tuple[str, int, str], dict[str, Any] | None] = {}
+    found: dict[tuple[str, int, str], Row | None] = {}
     for row in sorted(rows, key=lambda row: -row["tolerance"]):
         key = (row["problem"], row["cells"], row["scheme"])
         best = found.setdefault(key, None)
@@ -212,7 +212,7 @@ def time_to(rows: list[dict[str, Any]], error: float = 0.01) -> list[dict[str, A
     return table
 
 
-def growth(table: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def growth(table: list[Row]) -> list[Row]:
     """Fitted exponents of time and of sweeps times cells in the number of cells a side."""
     rows = []
     for problem, scheme in dict.fromkeys((row["problem"], row["scheme"]) for row in table):

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from jaxsand.goals.fields import LENGTH, METRES, Flag, Object, Pair, Several, Whole, read_object
+from jaxsand.goals.fields import LENGTH, METRES, Flag, Object, Pair, Several, WholeNumber, read_object
 from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.goals.shapes import WEIGHT, OneShape, Shape
 from jaxsand.goals.surfaces import rested
@@ -36,7 +36,7 @@ class Sheet:
 
     shape: Annotated[
         tuple[int, int],
-        Pair("the numbers of [rows, columns]", Whole(f"a whole number of cells from 1 to {_SIDE}", 1, _SIDE)),
+        Pair("the numbers of [rows, columns]", WholeNumber(f"a whole number of cells from 1 to {_SIDE}", 1, _SIDE)),
     ]
     spacing: Annotated[float, LENGTH]
 

@@ -123,23 +123,23 @@ def at_best(scene: Scene, start: np.ndarray, goal: Goal | np.ndarray, *, toleran
         0.048 True 0
     """
     wanted, height = as_goal(scene, goal), _started(scene, start, tolerance)
-    ground = _ground(scene, height, tolerance)
-    sand, best = ground.sand, height.copy()
+    limits = _limits(scene, height, tolerance)
+    sand, best = limits.sand, height.copy()
     want, above, below = (np.asarray(a)[sand] for a in (wanted.height, wanted.above, wanted.below))
-    cells = Cells(want, above, below, wanted.power)
+    cells = CellCosts(want, above, below, wanted.power)
     cost, bound = math.inf, 0.0
     before, steps = float(cells.cost(height[sand]).sum()), float(np.maximum(cells.above, cells.below).sum())
-    none = _ZERO**cells.power * max(before, steps * ground.unit**cells.power)
-    for h, flow, price in _iterates(ground, cells):
-        near = ground.feasible(h)
+    none = _ZERO**cells.power * max(before, steps * limits.unit**cells.power)
+    for h, flow, price in _iterates(limits, cells):
+        near = limits.feasible(h)
         left = float(cells.cost(near).sum())
         if left < cost:
             best[sand], cost = near, left
-        bound = max(bound, lagrangian(ground, cells, flow, price, cost))
+        bound = max(bound, lagrangian(limits, cells, flow, price, cost))
         if cost - bound <= max(_GAP * cost, none):
             break
     fixed = float(wanted.cost(np.where(sand, height - wanted.apart(height), height)))
-    if not ground.exact:
+    if not limits.exact:
         settled = settle(scene, best.astype(jnp.result_type(float)), stop=UntilStill(tolerance, bound=200_000))
         check(settled)
         best = np.asarray(settled.height, float)
@@ -159,7 +159,7 @@ def _started(scene: Scene, start: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Cells:
+class CellCosts:
     """The costs of cells: goals, NaN where a cell is free, and weights, all of one shape."""
 
     goal: np.ndarray
@@ -193,7 +193,7 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class Ground:
+class RestLimits:
     """What maps at rest keep to: the sand's cells, numbered row by row, and their links.
 
     Attributes:
@@ -268,7 +268,7 @@ def _spread(high: np.ndarray, tail: np.ndarray, head: np.ndarray, rise: np.ndarr
     return dijkstra(graph, indices=n)[:n] + deep
 
 
-def _ground(scene: Scene, start: np.ndarray, tolerance: float) -> Ground:
+def _limits(scene: Scene, start: np.ndarray, tolerance: float) -> RestLimits:
     """The limits of maps at rest; raises ValueError if the start lies below the floor, or every cell is solid."""
     shape, dx = scene.grid.shape, float(scene.grid.spacing)
     sand = ~np.asarray(scene.walls.solid) if isinstance(scene.walls, Walls) else np.ones(shape, bool)
@@ -293,7 +293,7 @@ def _ground(scene: Scene, start: np.ndarray, tolerance: float) -> Ground:
     exact = scene.grid.neighbours != "isotropic" and bool((up == level).all() and (down == level).all())
     total = max(float(start[sand].sum()), float(low.sum()))
     unit = float(mu[sand].mean()) * dx
-    return Ground(sand, one, two, up, down, low, high[sand], total, isinstance(scene.edge, Draining), exact, unit)
+    return RestLimits(sand, one, two, up, down, low, high[sand], total, isinstance(scene.edge, Draining), exact, unit)
 
 
 def _links(scene: Scene, sand: np.ndarray, drop: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -317,7 +317,7 @@ def _links(scene: Scene, sand: np.ndarray, drop: np.ndarray) -> tuple[np.ndarray
     return one, two, level
 
 
-def _iterates(ground: Ground, cells: Cells) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+def _iterates(limits: RestLimits, cells: CellCosts) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
     """Maps [n] (m), flows over the links and prices of sand that come ever nearer to the best ones.
 
     The alternating direction method of multipliers, over-relaxed: x is a map of the right volume, z and s are what the
@@ -325,11 +325,11 @@ def _iterates(ground: Ground, cells: Cells) -> Iterator[tuple[np.ndarray, np.nda
     units of the step that repose allows, from the mean, and the largest weight is 1. Both penalties grow or shrink
     together where x is much farther from z and s than these are from coming to rest, or the other way round.
     """
-    n, m, middle, unit = len(ground.low), len(ground.one), ground.total / len(ground.low), ground.unit
+    n, m, middle, unit = len(limits.low), len(limits.one), limits.total / len(limits.low), limits.unit
     heavy = float(max(cells.above.max(), cells.below.max())) or 1.0
-    scaled = Cells((cells.goal - middle) / unit, cells.above / heavy, cells.below / heavy, cells.power)
-    low, high, up, down = (a / unit for a in (ground.low - middle, ground.high - middle, ground.up, ground.down))
-    ends = (np.tile(np.arange(m), 2), np.append(ground.one, ground.two))
+    scaled = CellCosts((cells.goal - middle) / unit, cells.above / heavy, cells.below / heavy, cells.power)
+    low, high, up, down = (a / unit for a in (limits.low - middle, limits.high - middle, limits.up, limits.down))
+    ends = (np.tile(np.arange(m), 2), np.append(limits.one, limits.two))
     steps = sparse.csr_matrix((np.repeat([1.0, -1.0], m), ends), (m, n))
     back = steps.T.tocsr()
     rate, solve = 1.0, splu((sparse.eye(n) + back @ steps).tocsc()).solve
@@ -342,7 +342,7 @@ def _iterates(ground: Ground, cells: Cells) -> Iterator[tuple[np.ndarray, np.nda
             yield unit * x + middle, worth * v, -worth * float(u.mean())
         old = z + back @ s
         x = solve(z - u + back @ (s - v))
-        if not ground.drains or x.sum() > 0:
+        if not limits.drains or x.sum() > 0:
             x = x - x.mean()
         slopes = steps @ x
         near, over = _RELAXED * x + (1 - _RELAXED) * z, _RELAXED * slopes + (1 - _RELAXED) * s
@@ -360,38 +360,38 @@ def _size(*parts: np.ndarray) -> float:
     return math.hypot(*(float(np.linalg.norm(part)) for part in parts))
 
 
-def lagrangian(ground: Ground, cells: Cells, flow: np.ndarray, price: float, cost: float) -> float:
+def lagrangian(limits: RestLimits, cells: CellCosts, flow: np.ndarray, price: float, cost: float) -> float:
     """What no map within the limits costs less than, by these multipliers, unless `cost` is less; -inf if they tell nothing.
 
     Args:
-      ground: what maps at rest keep to.
+      limits: what maps at rest keep to.
       cells: the goal's costs.
       flow: for each link, a number of either sign.
       price: of sand; below 0 it counts as 0 where sand drains.
       cost: of some map within the limits.
     """
-    price = max(price, 0.0) if ground.drains else price
-    n = len(ground.low)
-    prices = np.bincount(ground.one, flow, n) - np.bincount(ground.two, flow, n) + price
-    x = cells.lowest(prices, *_box(ground, cells, cost))
+    price = max(price, 0.0) if limits.drains else price
+    n = len(limits.low)
+    prices = np.bincount(limits.one, flow, n) - np.bincount(limits.two, flow, n) + price
+    x = cells.lowest(prices, *_box(limits, cells, cost))
     if not np.isfinite(x).all():
         return -math.inf
-    limits = float((np.where(flow > 0, ground.up, ground.down) * np.abs(flow)).sum())
-    return min(float((cells.cost(x) + prices * x).sum()) - limits - price * ground.total, cost)
+    loose = float((np.where(flow > 0, limits.up, limits.down) * np.abs(flow)).sum())
+    return min(float((cells.cost(x) + prices * x).sum()) - loose - price * limits.total, cost)
 
 
-def _box(ground: Ground, cells: Cells, cost: float) -> tuple[np.ndarray, np.ndarray]:
+def _box(limits: RestLimits, cells: CellCosts, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """The least and the greatest height of every cell (m) in maps within the limits that cost no more than this.
 
     A cell that alone would cost more bounds the others by the links between. Where all hang together and no sand leaves,
     the mean bounds them too. So multipliers that are a little off for a cell of weight 0 still tell something.
     """
     far = [(cost / np.where(w > 0, w, 1)) ** (1 / cells.power) for w in (cells.below, cells.above)]
-    low = np.where(cells.below > 0, np.maximum(ground.low, cells.goal - far[0]), ground.low)
-    high = np.where(cells.above > 0, np.minimum(ground.high, cells.goal + far[1]), ground.high)
-    low, high = ground.least(low), ground.most(high)
-    if ground.drains:
+    low = np.where(cells.below > 0, np.maximum(limits.low, cells.goal - far[0]), limits.low)
+    high = np.where(cells.above > 0, np.minimum(limits.high, cells.goal + far[1]), limits.high)
+    low, high = limits.least(low), limits.most(high)
+    if limits.drains:
         return low, high
     first = np.where(np.arange(len(low)) == 0, 0, np.inf)
-    middle, across = ground.total / len(low), float(ground.most(first).max() - ground.least(-first).min())
+    middle, across = limits.total / len(low), float(limits.most(first).max() - limits.least(-first).min())
     return np.maximum(low, middle - across), np.minimum(high, middle + across)

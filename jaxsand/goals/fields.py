@@ -80,7 +80,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class Whole:
+class WholeNumber:
     """A whole number from `low` to `high`."""
 
     what: str

@@ -1,7 +1,7 @@
 """A goal that says what matters: a height map, and what it costs where sand stands above it or below it."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from jaxsand.scene.scene import Scene
 from jaxsand.scene.validation import concrete, short
 
 Power = Literal[1, 2]
+Maps = TypeVar("Maps", np.ndarray, jax.Array)
+"""Arrays of numpy or of JAX: what is given says what is returned."""
 
 
 @jax.tree_util.register_dataclass
@@ -74,7 +76,7 @@ class Goal:
         """
         return _space(self.height).isnan(self.height) | ((self.above == 0) & (self.below == 0))
 
-    def off(self, height: Any) -> Any:
+    def off(self, height: Maps) -> Maps:
         """How far a map stands from the goal where that costs.
 
         Args:
@@ -88,7 +90,7 @@ class Goal:
         costs = ((apart > 0) & (xp.asarray(self.above) > 0)) | ((apart < 0) & (xp.asarray(self.below) > 0))
         return xp.where(costs | ~xp.isfinite(apart), apart, 0)
 
-    def apart(self, height: Any) -> Any:
+    def apart(self, height: Maps) -> Maps:
         """How far a map stands above the goal, whether or not that costs.
 
         Args:
@@ -100,7 +102,7 @@ class Goal:
         xp = _space(height, self.height)
         return height - xp.where(xp.isnan(self.height), height, self.height)
 
-    def weight(self, off: Any) -> Any:
+    def weight(self, off: Maps) -> Maps:
         """The weight that differences of these signs have.
 
         Args:
@@ -111,7 +113,7 @@ class Goal:
         """
         return _space(off, self.above, self.below).where(off > 0, self.above, self.below)
 
-    def residual(self, height: Any) -> tuple[Any, Any]:
+    def residual(self, height: Maps) -> tuple[Maps, Maps]:
         """Differences such that the cost is sum |r|^p, for methods of least squares.
 
         Args:
@@ -126,7 +128,7 @@ class Goal:
         one = xp.asarray(self.above) == xp.asarray(self.below)
         return off * rate, xp.where((off == 0) & ~one, 0, rate)  # beside a kink, a cell at the goal may go either way
 
-    def cost(self, height: Any) -> Any:
+    def cost(self, height: Maps) -> Maps:
         """What a map costs, J.
 
         Args:
@@ -139,7 +141,7 @@ class Goal:
         size = apart**2 if self.power == 2 else abs(apart)
         return (self.weight(apart) * size).sum((-2, -1))
 
-    def slope(self, height: Any) -> Any:
+    def slope(self, height: Maps) -> Maps:
         """The derivative of the cost by the heights.
 
         Args:
@@ -151,7 +153,7 @@ class Goal:
         off = self.off(height)
         return self.weight(off) * (2 * off if self.power == 2 else _space(off).sign(off))
 
-    def distance(self, height: Any) -> Any:
+    def distance(self, height: Maps) -> Maps:
         """How far a map is from the goal, J^(1/p).
 
         Args:

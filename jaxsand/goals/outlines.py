@@ -13,11 +13,11 @@ from jaxsand.scene.grid import Grid, places
 
 _ROUNDING = 1e-9  # cells: what lies closer to an outline lies on it
 
-Cells = np.ndarray
+Mask = np.ndarray
 """Booleans [H, W]."""
 
 
-def inside(corners: np.ndarray, grid: Grid) -> Cells:
+def inside(corners: np.ndarray, grid: Grid) -> Mask:
     """The cells within a polygon of corners [n, 2] = x, y (m), where rays from them cross its sides an odd number of times.
 
     Centres on a left or lower side are inside, those on a right or upper one are not.
@@ -34,7 +34,7 @@ def inside(corners: np.ndarray, grid: Grid) -> Cells:
     return crossed.cumsum(1)[:, :columns] % 2 == 1
 
 
-def around(centre: tuple[float, float], inner: float, radius: float, grid: Grid) -> Cells:
+def ring(centre: tuple[float, float], inner: float, radius: float, grid: Grid) -> Mask:
     """The cells from `inner` up to, but not at, `radius` (m) from a centre (m)."""
     spacing = float(grid.spacing)
     x, y = places(grid.shape, spacing)
@@ -42,7 +42,7 @@ def around(centre: tuple[float, float], inner: float, radius: float, grid: Grid)
     return (inner <= distance) & (distance < radius)
 
 
-def near(strokes: np.ndarray, reach: float, grid: Grid) -> Cells:
+def near(strokes: np.ndarray, reach: float, grid: Grid) -> Mask:
     """The cells at most `reach` (m) from one of the strokes [n, 4] = x0, y0, x1, y1 (m)."""
     rows, columns = grid.shape
     found = np.zeros(grid.shape, bool)

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsand.goals.fields import LENGTH, METRES, POINT, Flag, Number, Pair, Points, Several, Text, read_object, wrong
 from jaxsand.goals.letters import letter_strokes, text_strokes
-from jaxsand.goals.outlines import Cells, around, inside, near, strip
+from jaxsand.goals.outlines import Mask, inside, near, ring, strip
 from jaxsand.scene.grid import Grid, places
 
 WEIGHT = Number("a weight from 0 to 1e6", 0, 1e6)
@@ -31,7 +31,7 @@ class Shape(Protocol):
     def check(self, name: str) -> None:
         """ValueError, with the shape's name in the drawing, where its fields do not go together."""
 
-    def covers(self, grid: Grid) -> Cells:
+    def covers(self, grid: Grid) -> Mask:
         """The cells whose centres the shape covers."""
 
     def over(self, beneath: np.ndarray, grid: Grid) -> np.ndarray:
@@ -86,7 +86,7 @@ class Rectangle(_Level):
     size: Annotated[tuple[float, float], Pair("length and width in metres, [length, width]", LENGTH)]
     turned_deg: Annotated[float, Number("degrees from -360 to 360", -360, 360)] = 0.0
 
-    def covers(self, grid: Grid) -> Cells:
+    def covers(self, grid: Grid) -> Mask:
         """The cells within it."""
         angle, half = math.radians(self.turned_deg), self.size[0] / 2
         along = np.array([[-1.0], [1.0]]) * (half * math.cos(angle), half * math.sin(angle))
@@ -100,7 +100,7 @@ class Polygon(_Level):
     points: Annotated[np.ndarray, Points("the corners as a list [[x, y], ...] in metres", 3)]
     holes: Annotated[tuple[np.ndarray, ...], _HOLES] = ()
 
-    def covers(self, grid: Grid) -> Cells:
+    def covers(self, grid: Grid) -> Mask:
         """The cells within it and in none of its holes."""
         found = inside(self.points, grid)
         for hole in self.holes:
@@ -122,9 +122,9 @@ class Disc(_Level):
         if self.inner >= self.radius:
             raise ValueError(f"{name}.inner: got {self.inner:g}, the radius is {self.radius:g}; give less than the radius")
 
-    def covers(self, grid: Grid) -> Cells:
+    def covers(self, grid: Grid) -> Mask:
         """The cells from the inner radius up to the outer one."""
-        return around(self.centre, self.inner, self.radius, grid)
+        return ring(self.centre, self.inner, self.radius, grid)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +134,7 @@ class Path(_Level):
     points: Annotated[np.ndarray, Points("two points or more as a list [[x, y], ...] in metres", 2)]
     width: Annotated[float, LENGTH]
 
-    def covers(self, grid: Grid) -> Cells:
+    def covers(self, grid: Grid) -> Mask:
         """The cells at most half the width from the line."""
         return near(np.concatenate([self.points[:-1], self.points[1:]], 1), self.width / 2, grid)
 
@@ -156,7 +156,7 @@ class Lettering(_Level):
         except ValueError as error:
             raise ValueError(f"{name}.{error}") from None
 
-    def covers(self, grid: Grid) -> Cells:
+    def covers(self, grid: Grid) -> Mask:
         """The cells at most half the width from a stroke; they are `size` high from their lower left corner on."""
         return near(np.tile(self.corner, 2) + self.size * _strokes(self.text), self.width / 2, grid)
 
@@ -175,7 +175,7 @@ class Ramp(_Weighted):
         if np.array_equal(*self.points):
             raise ValueError(f"{name}.points: got {self.points[0].tolist()} twice; give two different points")
 
-    def covers(self, grid: Grid) -> Cells:
+    def covers(self, grid: Grid) -> Mask:
         """The cells within the rectangle."""
         return inside(strip(self.points, self.width), grid)
 

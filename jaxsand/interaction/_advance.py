@@ -1,13 +1,13 @@
 """A blade moves ahead, by sub-steps; a step of a loop (while_loop.py) is several of them, within a spacing.
 
-The sub-steps ahead are pulled back in their block alone: from the block before a step its sub-steps are made again, and
+The sub-steps ahead are differentiated in their block alone: from the block before a step its sub-steps are made again, and
 each is differentiated by JAX but for the sand's coming to rest, whose derivative resting.py writes out.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,28 +15,35 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, split
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._block import Block, First, Moving, Stand, View, Way, rotated
+from jaxsand.interaction._block import Block, First, Moving, Openness, View, Way, rotated
 from jaxsand.interaction._frame import Frame, cut, frame_of, paste, places, shifted, shifted_back
-from jaxsand.interaction._resting_adjoint import Rested, blank, rest_pulled, rest_taped
+from jaxsand.interaction._resting_adjoint import Rested, blank, rest_taped, rest_vjp
 from jaxsand.interaction.resting import Links, Sand, bring_to_rest
 from jaxsand.interaction.stencil import inner, spread
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.relaxation.ghost_cells import Lost, at, halo
+from jaxsand.relaxation.ghost_cells import ExactSum, at, halo
 
 Rest = Callable[[Sand, jax.Array, int, jax.Array, Fluxes], tuple[jax.Array, Fluxes]]
 
 
-State = tuple[jax.Array, Fluxes, Stand]  # heights, fluxes, and how sand stood last in the block
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class InBlock:
+    """The sand of a block: heights and fluxes (quanta), and how it stood last."""
+
+    height: jax.Array
+    flux: Fluxes
+    openness: Openness
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Ready:
+class Disturbed:
     """Sand that is yet to come to rest: how it stands near the blade and in the block, the blade's bottom (quanta; a number
     or a map near the blade), at which rate sand flows, its heights, a guess of what flows, and which share of a whole
     sub-step this one is."""
 
-    near: Stand
+    near: Openness
     bottom: jax.Array
     sand: Sand
     rate: jax.Array
@@ -44,14 +51,14 @@ class Ready:
     guess: Fluxes
     part: jax.Array
 
-    def stand(self) -> Stand:
+    def openness(self) -> Openness:
         """What the next sub-step needs to know of how the tool stands here."""
-        return Stand(self.sand.gates, self.sand.open, self.sand.stretch)
+        return Openness(self.sand.gates, self.sand.open, self.sand.stretch)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Cut:
+class SubStep:
     """What a blade does in a sub-step: the leg, with the bottom where the blade is now; its footprints; whether it moves, or
     has just come down; which share of a whole sub-step this one is; and what leaves the cells near the blade (quanta)."""
 
@@ -62,8 +69,26 @@ class Cut:
     taken: jax.Array
 
 
+class LegParams(Protocol):
+    """What a step of a leg depends on."""
+
+    @property
+    def length(self) -> jax.Array:
+        """Length of the leg (spacings)."""
+
+    @property
+    def angle(self) -> jax.Array:
+        """Angle by which the tool turns in place before the leg (rad)."""
+
+
+L = TypeVar("L", bound=LegParams)
+Floats = tuple[jax.Array, ...]  # the floating-point leaves of a leg, or cotangents of them
+BlockSand = tuple[jax.Array, Fluxes]  # heights and fluxes of a block
+StepRecord = Moving | BlockSand  # the sand before a step, or that of its block
+
+
 @dataclass(frozen=True)
-class Step:
+class LegStep(Generic[L]):
     """A step of a loop that computes a batch in the last axis; see while_loop.py."""
 
     block: Block
@@ -80,28 +105,28 @@ class Step:
         """The fluxes to start from after a sub-step that is the share `part` of a whole one, whose fluxes are `flux`."""
         return tuple(f + (1 - part) * b for f, b in zip(flux, before, strict=True)) if self.keeps else flux
 
-    def work(self, way: Way) -> jax.Array:
+    def work(self, leg: L) -> jax.Array:
         """How far the step leads: what its number of repetitions grows with."""
-        return way.length + jnp.abs(way.angle)
+        return leg.length + jnp.abs(leg.angle)
 
-    def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, leg: L, k: jax.Array, sand: Moving, /) -> Moving:
         raise NotImplementedError
 
-    def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, Any]:
+    def recorded(self, leg: L, k: jax.Array, sand: Moving, /) -> tuple[Moving, StepRecord]:
         """The sand after step k, and the sand before it as the record."""
-        return self(way, k, sand), sand
+        return self(leg, k, sand), sand
 
-    def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
+    def jvp(self, leg: L, k: jax.Array, record: StepRecord, dleg: Floats, dsand: Moving, /) -> Moving:
         """The jvp, by JAX."""
-        return Plain(self).push(way, k, record, dway, dsand)
+        return Plain(self).jvp(leg, k, record, dleg, dsand)
 
-    def pull(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
+    def vjp(self, leg: L, k: jax.Array, record: StepRecord, cotangent: Moving, /) -> tuple[Floats, Moving]:
         """The vjp, by JAX."""
-        return Plain(self).pull(way, k, record, cotangent)
+        return Plain(self).vjp(leg, k, record, cotangent)
 
 
 @dataclass(frozen=True)
-class Advance(Step):
+class Advance(LegStep[Way]):
     """So many sub-steps ahead, `chunk` of them within a spacing, in a block around where they lead.
 
     If the blade has just come down, the first step lets the sand come to rest around it.
@@ -113,7 +138,7 @@ class Advance(Step):
     lowered: bool = False
     rest: Rest = bring_to_rest
 
-    def done(self, way: Way, k: jax.Array, _: Any) -> jax.Array:
+    def done(self, way: Way, k: jax.Array, _: Moving) -> jax.Array:
         """Whether the leg is complete before step k."""
         gone = (k - int(self.lowered)).astype(way.length.dtype) * (self.chunk * self.substep)
         return (k >= int(self.lowered)) & jnp.all(gone >= way.length)
@@ -121,7 +146,7 @@ class Advance(Step):
     def __call__(self, way: Way, k: jax.Array, sand: Moving) -> Moving:
         return self.recorded(way, k, sand)[0]
 
-    def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, Any]:
+    def recorded(self, way: Way, k: jax.Array, sand: Moving) -> tuple[Moving, StepRecord]:
         """The sand after step k, and what its derivative needs."""
         frame = frame_of(self.block.shape, way.start)
         first, by = self.block_of(way, frame, k)
@@ -130,24 +155,27 @@ class Advance(Step):
         cover, rate = self.felt(way, k, first, view, old)
         gone = jnp.zeros_like(old) if self.block.drains else None
 
-        def substep(i: jax.Array, carry: tuple[State, jax.Array | None, Lost]) -> tuple[State, jax.Array | None, Lost]:
-            (h, flux, stand), gone, scooped = carry
+        def substep(
+            i: jax.Array, carry: tuple[InBlock, jax.Array | None, ExactSum | None]
+        ) -> tuple[InBlock, jax.Array | None, ExactSum | None]:
+            state, gone, scooped = carry
+            h = state.height
             cut = self.cut(way, k, first, view, i, self.block.part(h))
             taken = cut.taken
             if way.room is not None:
                 into, scooped = blade.scooped(way.room, scooped, taken * at(self.block.part(view.holds)))
                 h, taken = self.block.put(h, self.block.part(h) - into), taken - into
-            ready, lost = self.displaced(cut, rate, view, (h, flux, stand), taken)
-            h, new = self.rest(ready.sand, ready.rate, self.sweeps, ready.height, ready.guess)
+            disturbed, lost = self.displaced(cut, rate, view, replace(state, height=h), taken)
+            h, new = self.rest(disturbed.sand, disturbed.rate, self.sweeps, disturbed.height, disturbed.guess)
             if gone is not None and lost is not None:
                 gone = gone + lost + new[-1]
-            return (h, self.kept(ready.part, new, flux), ready.stand()), gone, scooped
+            return InBlock(h, self.kept(disturbed.part, new, state.flux), disturbed.openness()), gone, scooped
 
-        state = (old, flux, self.block.clear(view))
-        (new, after, _), gone, scooped = lax.fori_loop(0, self.chunk, substep, (state, gone, sand.scooped))
-        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
+        state = InBlock(old, flux, self.block.clear(view))
+        state, gone, scooped = lax.fori_loop(0, self.chunk, substep, (state, gone, sand.scooped))
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, state.height, cover))
         lost = self.block.lose(way, view, sand.lost, gone)
-        out = Moving(self.block.back(way, view, sand.height, new), lost, after, edge, scooped)
+        out = Moving(self.block.back(way, view, sand.height, state.height), lost, state.flux, edge, scooped)
         by_jax = self.block.drains or way.room is not None or way.base is not None
         if by_jax or way.drop.ndim == sand.height.ndim:
             return out, sand
@@ -166,14 +194,14 @@ class Advance(Step):
         lowest = way if way.rise is None else way.at(jnp.where(way.rise < 0, begin + ahead, begin))
         return cover, way.rate * self.block.contact(lowest, view, cover, h)
 
-    def ready(
-        self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: State
-    ) -> tuple[Ready, jax.Array | None]:
+    def disturbed(
+        self, way: Way, rate: jax.Array, k: jax.Array, first: First, view: View, i: jax.Array, state: InBlock
+    ) -> tuple[Disturbed, jax.Array | None]:
         """Sub-step i of step k up to when the sand comes to rest, and what was lost."""
-        cut = self.cut(way, k, first, view, i, self.block.part(state[0]))
+        cut = self.cut(way, k, first, view, i, self.block.part(state.height))
         return self.displaced(cut, rate, view, state, cut.taken)
 
-    def cut(self, way: Way, k: jax.Array, first: First, view: View, i: jax.Array, near: jax.Array) -> Cut:
+    def cut(self, way: Way, k: jax.Array, first: First, view: View, i: jax.Array, near: jax.Array) -> SubStep:
         """What the blade cuts in sub-step i of step k from the heights `near` it."""
         moving = k >= int(self.lowered)
         begin = jnp.where(moving, (k - int(self.lowered)) * self.chunk + i, 0).astype(way.length.dtype) * self.substep
@@ -185,7 +213,7 @@ class Advance(Step):
         else:
             taken, bottom = self.beneath(way, reach, view, near, begin, ahead)
             way = replace(way, bottom=bottom * spread(way.quantum, near))
-        return Cut(way, reach, moving, jnp.where(moving, ahead / self.substep, 1), jnp.where(ahead > 0, taken, 0))
+        return SubStep(way, reach, moving, jnp.where(moving, ahead / self.substep, 1), jnp.where(ahead > 0, taken, 0))
 
     def reach(self, way: Way, first: First, begin: jax.Array, ahead: jax.Array) -> blade.Reach:
         """The blade's footprints as it moves ahead from `begin` (spacings)."""
@@ -218,10 +246,10 @@ class Advance(Step):
         return blade.cleared_beneath(reach, near, old, new, spread(way.rise / way.spacing, near)), new
 
     def displaced(
-        self, cut: Cut, rate: jax.Array, view: View, state: State, taken: jax.Array
-    ) -> tuple[Ready, jax.Array | None]:
+        self, cut: SubStep, rate: jax.Array, view: View, state: InBlock, taken: jax.Array
+    ) -> tuple[Disturbed, jax.Array | None]:
         """The sand after `taken` of what was cut has left to the front, yet to come to rest, and what was lost."""
-        h, flux, clear = state
+        h, flux, clear = state.height, state.flux, state.openness
         way, frame = cut.way, frame_of(self.block.shape, cut.way.start)
         pose = frame.pose
         room = self.block.part(view.holds if view.beyond is None else view.holds + view.beyond)
@@ -232,10 +260,10 @@ class Advance(Step):
             repose = jnp.arctan(self.block.part(jnp.broadcast_to(view.drop, h.shape)) * (way.quantum / way.spacing))
             shares = blade.slid(cos, sin, spread(frame.mirrors(way.yaw), taken), repose)
         h, lost = self.block.displaced(way, view, shares, h, taken)
-        around = self.block.around(view, cut.reach)
-        sand = self.block.sand(way, view, clear, around)
-        guess = self.block.guess(around.gates, jnp.where(cut.moving, cut.part, 0), flux)
-        return Ready(around, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
+        near = self.block.beside(view, cut.reach)
+        sand = self.block.sand(way, view, clear, near)
+        guess = self.block.guess(near.gates, jnp.where(cut.moving, cut.part, 0), flux)
+        return Disturbed(near, way.bottom / way.quantum, sand, rate * cut.part, h, guess, cut.part), lost
 
     def bottom(self, way: Way, reach: blade.Reach, by: jax.Array) -> jax.Array:
         """The blade's bottom over each cell near it (quanta), when it has moved by a length (spacings).
@@ -253,15 +281,15 @@ class Advance(Step):
         past = jnp.where(way.rise > 0, jnp.minimum(behind, by), 0)
         return (way.bottom + (by - past) * way.rise) / way.quantum
 
-    def push(self, way: Way, k: jax.Array, record: Any, dway: Any, dsand: Moving) -> Moving:
+    def jvp(self, way: Way, k: jax.Array, record: StepRecord, dway: Floats, dsand: Moving) -> Moving:
         """The jvp: of the step made again in its block."""
         if isinstance(record, Moving):
-            return super().push(way, k, record, dway, dsand)
+            return super().jvp(way, k, record, dway, dsand)
         inside = _Inside(self, way, k, record)
         block = cut(inside.where, dsand.height, 0.0) / way.quantum
         flux = shifted(dsand.flux, inside.by) if self.block.follows else dsand.flux
 
-        def whole(floats: Any, h: jax.Array, flux: Fluxes) -> Any:
+        def whole(floats: Floats, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
             rate = inside.rate(floats, h)
             return lax.fori_loop(0, self.chunk, lambda i, state: inside.substep(floats, rate, i, *state), (h, flux))
 
@@ -269,13 +297,13 @@ class Advance(Step):
         height = paste(inside.where, dsand.height, block * at(inside.holds) * way.quantum)
         return Moving(height, None, flux, dsand.edge)
 
-    def pull(self, way: Way, k: jax.Array, record: Any, cotangent: Moving) -> tuple[Any, Moving]:
+    def vjp(self, way: Way, k: jax.Array, record: StepRecord, cotangent: Moving) -> tuple[Floats, Moving]:
         """The vjp: of the step made again in its block."""
         if isinstance(record, Moving):
-            return super().pull(way, k, record, cotangent)
+            return super().vjp(way, k, record, cotangent)
         inside = _Inside(self, way, k, record)
         gain = cut(inside.where, cotangent.height, 0.0) * way.quantum
-        of_floats, dh, dflux = inside.pull((gain, cotangent.flux))
+        of_floats, dh, dflux = inside.vjp((gain, cotangent.flux))
         height = paste(inside.where, cotangent.height, dh * at(inside.holds) / way.quantum)
         dflux = shifted_back(dflux, inside.by) if self.block.follows else dflux
         return of_floats, Moving(height, None, dflux, cotangent.edge)
@@ -298,27 +326,27 @@ class _Inside:
     def _view(self, way: Way) -> View:
         return View(self.where, self.holds, way.drop / way.quantum, None, None)
 
-    def rate(self, floats: Any, h: jax.Array) -> jax.Array:
+    def rate(self, floats: Floats, h: jax.Array) -> jax.Array:
         way = self.merge(floats)
         return self.advance.felt(way, self.k, self.first, self._view(way), h)[1]
 
-    def ready(self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Ready:
+    def disturbed(self, i: jax.Array, floats: Floats, rate: jax.Array, h: jax.Array, flux: Fluxes) -> Disturbed:
         way = self.merge(floats)
         view = self._view(way)
-        state = (h, flux, self.advance.block.clear(view))
-        return self.advance.ready(way, rate, self.k, self.first, view, i, state)[0]
+        state = InBlock(h, flux, self.advance.block.clear(view))
+        return self.advance.disturbed(way, rate, self.k, self.first, view, i, state)[0]
 
-    def substep(self, floats: Any, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
-        ready = self.ready(i, floats, rate, h, flux)
-        h, new = bring_to_rest(ready.sand, ready.rate, self.advance.sweeps, ready.height, ready.guess)
-        return h, self.advance.kept(ready.part, new, flux)
+    def substep(self, floats: Floats, rate: jax.Array, i: jax.Array, h: jax.Array, flux: Fluxes) -> tuple[jax.Array, Fluxes]:
+        disturbed = self.disturbed(i, floats, rate, h, flux)
+        h, new = bring_to_rest(disturbed.sand, disturbed.rate, self.advance.sweeps, disturbed.height, disturbed.guess)
+        return h, self.advance.kept(disturbed.part, new, flux)
 
-    def pull(self, cotangent: tuple[jax.Array, Fluxes]) -> tuple[Any, jax.Array, Fluxes]:
+    def vjp(self, cotangent: BlockSand) -> tuple[Floats, jax.Array, Fluxes]:
         """The cotangents of the floats, the heights and the fluxes: from the last sub-step backwards, made again."""
         chunk, sweeps, floats = self.advance.chunk, self.advance.sweeps, self.floats
         rate, to_rate = jax.vjp(self.rate, floats, self.state[0])
 
-        def again(i: jax.Array, carry: Any) -> Any:
+        def again(i: jax.Array, carry: tuple[BlockSand, BlockSand]) -> tuple[BlockSand, BlockSand]:
             state, tape = carry
             tape = jax.tree.map(lambda t, x: lax.dynamic_update_index_in_dim(t, x, i, 0), tape, state)
             return self.substep(floats, rate, i, *state), tape
@@ -326,21 +354,21 @@ class _Inside:
         tape = jax.tree.map(lambda x: jnp.zeros((chunk, *x.shape), x.dtype), self.state)
         _, tape = lax.fori_loop(0, chunk, again, (self.state, tape))
 
-        def fetched(i: jax.Array) -> Any:
+        def fetched(i: jax.Array) -> BlockSand:
             return jax.tree.map(lambda t: lax.dynamic_index_in_dim(t, i, 0, keepdims=False), tape)
 
         def back(j: jax.Array, carry: Any) -> Any:
             state, of_floats, of_rate, of_state, steps = carry
             i = chunk - 1 - j
             if self.advance.block.neighbours == "isotropic":
-                pulled = jax.vjp(lambda *x: self.substep(x[0], x[1], i, *x[2:]), floats, rate, *state)[1]
-                df, dr, *of_state = pulled(of_state)
+                vjp = jax.vjp(lambda *x: self.substep(x[0], x[1], i, *x[2:]), floats, rate, *state)[1]
+                df, dr, *of_state = vjp(of_state)
             else:
-                (depends, carried), pulled, sand = jax.vjp(partial(self._depends, i), floats, rate, *state, has_aux=True)
+                (depends, carried), vjp, sand = jax.vjp(partial(self._depends, i), floats, rate, *state, has_aux=True)
                 model = Links(sand, depends.rate)
                 steps = rest_taped(model, sweeps, depends.height, depends.guess, steps)
-                rested = rest_pulled(model, sweeps, self.advance.block.part, steps, of_state)
-                df, dr, *of_state = pulled((rested, of_state[1] if carried else ()))
+                rested = rest_vjp(model, sweeps, self.advance.block.part, steps, of_state)
+                df, dr, *of_state = vjp((rested, of_state[1] if carried else ()))
             return fetched(i - 1), jax.tree.map(jnp.add, of_floats, df), of_rate + dr, tuple(of_state), steps
 
         none = jax.tree.map(jnp.zeros_like, (floats, rate))
@@ -350,10 +378,12 @@ class _Inside:
         return jax.tree.map(jnp.add, of_floats, df), dh + more, dflux
 
     def _depends(
-        self, i: jax.Array, floats: Any, rate: jax.Array, h: jax.Array, flux: Fluxes
+        self, i: jax.Array, floats: Floats, rate: jax.Array, h: jax.Array, flux: Fluxes
     ) -> tuple[tuple[Rested, Fluxes], Sand]:
         """What the sand's coming to rest depends on, the fluxes that are kept beside its own, and the sand."""
-        ready = self.ready(i, floats, rate, h, flux)
-        near, sand = ready.near, ready.sand
-        rested = Rested(near.gates, near.stretch, ready.bottom, sand.drop, ready.rate, ready.height, ready.guess)
-        return (rested, tuple((1 - ready.part) * f for f in flux) if self.advance.keeps else ()), sand
+        disturbed = self.disturbed(i, floats, rate, h, flux)
+        near, sand = disturbed.near, disturbed.sand
+        rested = Rested(
+            near.gates, near.stretch, disturbed.bottom, sand.drop, disturbed.rate, disturbed.height, disturbed.guess
+        )
+        return (rested, tuple((1 - disturbed.part) * f for f in flux) if self.advance.keeps else ()), sand

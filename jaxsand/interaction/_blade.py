@@ -20,7 +20,7 @@ from jax import lax
 from jaxsand.interaction._displacement import EIGHT, shares
 from jaxsand.interaction.stencil import both_ends, inner, outer, seen, spread, total
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.relaxation.ghost_cells import Lost, at, counted, truncate
+from jaxsand.relaxation.ghost_cells import ExactSum, at, counted, truncate
 from jaxsand.scene.grid import Neighbours
 
 _LEAST = 1e-4
@@ -161,7 +161,7 @@ def cleared_beneath(reach: Reach, h: jax.Array, old: jax.Array, new: jax.Array, 
     return beneath + cleared(reach, h - beneath, new, jnp.clip(-rise / _SINKS, 0, 1))
 
 
-def scooped(room: jax.Array | None, account: Lost, taken: jax.Array) -> tuple[jax.Array | float, Lost]:
+def scooped(room: jax.Array | None, account: ExactSum | None, taken: jax.Array) -> tuple[jax.Array | float, ExactSum | None]:
     """What of the sand that is taken up goes into a bucket (quanta), and the bucket's account afterwards.
 
     `room` is what it could take up at first (quanta), None where there is no bucket. When it becomes full, it takes the same
@@ -169,7 +169,7 @@ def scooped(room: jax.Array | None, account: Lost, taken: jax.Array) -> tuple[ja
     """
     if room is None or account is None:
         return 0.0, account
-    wanted, left = total(taken), jnp.maximum(room - (account[0] + account[1]), 0)
+    wanted, left = total(taken), jnp.maximum(room - account.value, 0)
     full = wanted > left
     share = jnp.where(full, jnp.where(full, left, 0) / jnp.where(full, wanted, 1), 1)
     into = truncate(taken * spread(share, taken))

@@ -1,7 +1,6 @@
 """The block of the map around a tool: how it is read and written back, and how the sand in it stands."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from jaxsand.interaction.ground import Relief
 from jaxsand.interaction.resting import Sand, where_open
 from jaxsand.interaction.stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation.flux import Fluxes
-from jaxsand.relaxation.ghost_cells import Lost, at, halo, lose, nearest
+from jaxsand.relaxation.ghost_cells import ExactSum, at, halo, lose, nearest
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.tools import Pose
 
@@ -81,14 +80,14 @@ class Moving:
         lost: account of what drained, flat maps; see `ghost_cells.lose`.
         flux: fluxes of the last sub-step in the block around the blade (quanta).
         edge: largest change of height at the block's edge so far (spacings).
-        scooped: account (quanta) of what a bucket took up so far, a pair of numbers, or None for other tools.
+        scooped: account (quanta) of what a bucket took up so far, or None for other tools.
     """
 
     height: jax.Array
-    lost: Lost
+    lost: ExactSum | None
     flux: Fluxes
     edge: jax.Array
-    scooped: Lost = None
+    scooped: ExactSum | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -115,7 +114,7 @@ class View:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Stand:
+class Openness:
     """How sand stands around a tool: the open share of links (`gates`) and of cells (`open`), and how much higher sand
     stands in partly covered cells (`stretch`); see resting.py."""
 
@@ -224,13 +223,13 @@ class Block:
         """The bottom of a tool over each cell of the inner part (quanta), which cuts no floor: `bottom`, or the floor."""
         return bottom if view.base is None else jnp.maximum(bottom, self.part(view.base))
 
-    def lose(self, way: Way, view: View, lost: Lost, amount: jax.Array | None) -> Lost:
+    def lose(self, way: Way, view: View, lost: ExactSum | None, amount: jax.Array | None) -> ExactSum | None:
         """The account of losses after the block lost an amount (quanta)."""
         if lost is None or amount is None:
             return lost
-        block = (cut(view.where, lost[0], 0.0), cut(view.where, lost[1], 0.0))
-        low, high = lose(way.quantum, block, amount * way.quantum)
-        return paste(view.where, lost[0], low), paste(view.where, lost[1], high)
+        block = ExactSum(cut(view.where, lost.low, 0.0), cut(view.where, lost.high, 0.0))
+        block = lose(way.quantum, block, amount * way.quantum)
+        return ExactSum(paste(view.where, lost.low, block.low), paste(view.where, lost.high, block.high))
 
     def touched(self, way: Way, frame: Frame, first: First, old: jax.Array, new: jax.Array, cover: jax.Array) -> jax.Array:
         """The largest change of height (spacings) in the block's outermost cells, along edges that are not the map's.
@@ -239,7 +238,7 @@ class Block:
         """
         if not self.follows:
             return jnp.zeros_like(way.length)
-        near: Any = False
+        near: jax.Array | bool = False
         for axis, begin, cells in zip((1, 0), first, frame.extent(), strict=True):
             i = numbers(self.size, axis, begin)
             near = near | ((i < SPARE) & (begin > 0)) | ((i >= self.size - SPARE) & (begin + self.size < cells))
@@ -247,18 +246,18 @@ class Block:
         change = jnp.where(covered, jnp.inf, jnp.abs(new - old) * (way.quantum / way.spacing))
         return lax.stop_gradient(jnp.max(jnp.where(near, change, 0), axis=(0, 1)))
 
-    def clear(self, view: View) -> Stand:
+    def clear(self, view: View) -> Openness:
         """How sand stands in the block where no blade is."""
         gates = tuple(here * there for here, there in both_ends(self.neighbours, view.holds))
-        return Stand(gates, at(view.holds), jnp.zeros_like(at(view.holds)))
+        return Openness(gates, at(view.holds), jnp.zeros_like(at(view.holds)))
 
-    def around(self, view: View, reach: blade.Reach) -> Stand:
+    def beside(self, view: View, reach: blade.Reach) -> Openness:
         """How sand stands in the inner part, around a blade."""
         free, gates = blade.gates(self.neighbours, reach, self.part(view.holds))
         free = inner(free)
-        return Stand(gates, free, (1 - free) / jnp.maximum(free, blade.SLIVER) * at(self.part(view.holds)))
+        return Openness(gates, free, (1 - free) / jnp.maximum(free, blade.SLIVER) * at(self.part(view.holds)))
 
-    def sand(self, way: Way, view: View, clear: Stand, near: Stand) -> Sand:
+    def sand(self, way: Way, view: View, clear: Openness, near: Openness) -> Sand:
         """The sand of the block: `clear` gives how it stands without a blade, and `near` how in the inner part."""
         stand = jax.tree.map(self.put, clear, near)
         rim = None if way.level is None else way.level / way.quantum

@@ -8,7 +8,7 @@ l its length. A sweep adds G (rate g e / l) to the heights; see flux_adjoint.py.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +16,14 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, Tree, repeat, split
 from jaxsand.relaxation import flux_adjoint
-from jaxsand.relaxation.flux import Around, flows
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, stored, total
+from jaxsand.relaxation.flux import ToolInSand, flows
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, halo, stored, total
 from jaxsand.relaxation.sweep import Flow, counted, pass_over
 from jaxsand.scene.grid import links
 
-Params: TypeAlias = tuple[Bed, Flow, Around]
-State: TypeAlias = tuple[jax.Array, Lost]
+Params: TypeAlias = tuple[Bed, Flow, ToolInSand]
+State: TypeAlias = tuple[jax.Array, ExactSum | None]
+Carry: TypeAlias = tuple[jax.Array, list[jax.Array], list[jax.Array], jax.Array, jax.Array]
 
 
 @dataclass(frozen=True)
@@ -39,24 +40,24 @@ class Beside:
         """The state after the sweeps, and the state before them as the record."""
         return self(params, k, state), state
 
-    def push(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
+    def jvp(self, params: Params, k: jax.Array, record: State, dparams: Tree, dstate: State) -> State:
         """The jvp, by JAX."""
-        return Plain(self).push(params, k, record, dparams, dstate)
+        return Plain(self).jvp(params, k, record, dparams, dstate)
 
-    def pull(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
+    def vjp(self, params: Params, k: jax.Array, record: State, cotangent: State) -> tuple[Tree, State]:
         """The vjp: written out for 4 and 8 neighbours, else by JAX."""
-        bed, flow, around = params
+        bed, flow, tool = params
         if not bed.by_links or not self.sweeps:
-            return Plain(self).pull(params, k, record, cotangent)
-        of = pull(bed, flow, around, surfaces(bed, flow, around, self.sweeps, record[0]), cotangent[0])
-        dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
-        daround = replace(daround, open=halo(of.open, 0.0), stretch=of.stretch, bottom=of.bottom)
-        dparams = (replace(dbed, drop=of.drop), replace(dflow, rate=of.rate), daround)
+            return Plain(self).vjp(params, k, record, cotangent)
+        of = vjp(bed, flow, tool, surfaces(bed, flow, tool, self.sweeps, record[0]), cotangent[0])
+        dbed, dflow, dtool = jax.tree.map(jnp.zeros_like, params)
+        dtool = replace(dtool, open=halo(of.open, 0.0), stretch=of.stretch, bottom=of.bottom)
+        dparams = (replace(dbed, drop=of.drop), replace(dflow, rate=of.rate), dtool)
         return split(dparams)[0], (of.height, None)
 
 
 @dataclass(frozen=True)
-class Pulled:
+class SweepCotangents:
     """The cotangents of what some sweeps depend on: the height [H, W] before them, the tool's `open` share, `stretch` and
     `bottom`, the sweeps' `rate`, and the bed's `drop`."""
 
@@ -68,37 +69,37 @@ class Pulled:
     drop: jax.Array
 
 
-def surfaces(bed: Bed, flow: Flow, around: Around, sweeps: int, height: jax.Array) -> jax.Array:
+def surfaces(bed: Bed, flow: Flow, tool: ToolInSand, sweeps: int, height: jax.Array) -> jax.Array:
     """The surface before each sweep, [sweeps, H, W]."""
 
     def again(i: jax.Array, kept: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         h, tape = kept
-        tape = lax.dynamic_update_index_in_dim(tape, around.surface(h), i, 0)
-        return _sweep(bed, flow, around, h, None)[0], tape
+        tape = lax.dynamic_update_index_in_dim(tape, tool.surface(h), i, 0)
+        return _sweep(bed, flow, tool, h, None)[0], tape
 
     tape = jnp.zeros((sweeps, *height.shape), height.dtype)
     h, tape = lax.fori_loop(0, sweeps - 1, again, (height, tape))
-    return lax.dynamic_update_index_in_dim(tape, around.surface(h), sweeps - 1, 0)
+    return lax.dynamic_update_index_in_dim(tape, tool.surface(h), sweeps - 1, 0)
 
 
-def _sweep(bed: Bed, flow: Flow, around: Around, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def _sweep(bed: Bed, flow: Flow, tool: ToolInSand, h: jax.Array, lost: ExactSum | None) -> tuple[jax.Array, ExactSum | None]:
     """One sweep of a map [H, W]; only its surface needs ghost cells."""
-    moved = counted(flow, flows(bed, around.open, halo(around.surface(h))))
+    moved = counted(flow, flows(bed, tool.open, halo(tool.surface(h))))
     return pass_over(bed, flow, moved, h, lost)
 
 
 _SWEEP = Plain(lambda params, _, state: _sweep(*params, *state))
 
 
-def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.Array) -> Pulled:
+def vjp(bed: Bed, flow: Flow, tool: ToolInSand, tape: jax.Array, cotangent: jax.Array) -> SweepCotangents:
     """The vjp of the sweeps whose surfaces are on the tape, for a cotangent [H, W] of the height after them."""
     sweeps = tape.shape[0]
-    gates = [jnp.minimum(here, there) for here, there in flux_adjoint.pairs(bed, around.open)]
+    gates = [jnp.minimum(here, there) for here, there in flux_adjoint.pairs(bed, tool.open)]
     lengths = [length for _, _, length in links(bed.neighbours)]
     most = flux_adjoint.yields(bed)
     per_cell = bool(bed.drop.ndim)
 
-    def stage(j: jax.Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+    def stage(j: jax.Array, carry: Carry) -> Carry:
         gain, excess, tilt, lift, moved = carry
         s = halo(lax.dynamic_index_in_dim(tape, sweeps - 1 - j, keepdims=False))
         rises = flux_adjoint.steps(bed, s)
@@ -117,10 +118,10 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
             tilt = [tilt[0] + sum(g * x for g, x in zip(gates, signed, strict=True))]
         onward = tuple(g * (y / length) for g, y, length in zip(gates, passed, lengths, strict=True))
         slope = at(halo(flow.rate * flux_adjoint.gains(bed, onward), 0.0))
-        rise = at(s) - around.bottom
+        rise = at(s) - tool.bottom
         raised = jnp.where(rise > 0, slope, 0)
         return (
-            gain + slope + raised * around.stretch,
+            gain + slope + raised * tool.stretch,
             excess,
             tilt,
             lift + raised,
@@ -138,11 +139,11 @@ def pull(bed: Bed, flow: Flow, around: Around, tape: jax.Array, cotangent: jax.A
         )
     else:
         drop = flow.rate * total(tilt[0])
-    return Pulled(
+    return SweepCotangents(
         gain,
-        -flow.rate * at(flux_adjoint.to_less_open(bed, around.open, per_length)),
-        moved / (1 + around.stretch),
-        -flux_adjoint.to_shape(lift * around.stretch, around.bottom),
+        -flow.rate * at(flux_adjoint.to_less_open(bed, tool.open, per_length)),
+        moved / (1 + tool.stretch),
+        -flux_adjoint.to_shape(lift * tool.stretch, tool.bottom),
         -total(sum(g * e for g, e in zip(gates, per_length, strict=True))),
         drop,
     )

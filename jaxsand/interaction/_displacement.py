@@ -12,27 +12,41 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsand.autodiff.while_loop import repeat
+from jaxsand.autodiff.while_loop import Tree, repeat
 from jaxsand.interaction._contact_sweeps import Beside
-from jaxsand.relaxation.flux import stand
-from jaxsand.relaxation.ghost_cells import Bed, Lost, truncate
+from jaxsand.relaxation.flux import tool_in_sand
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, truncate
 from jaxsand.relaxation.sweep import Flow
 
 EIGHT = tuple((di, dj) for di in (-1, 0, 1) for dj in (-1, 0, 1) if di or dj)
 Shares = list[jax.Array]
-Carried = tuple[jax.Array, jax.Array | None, jax.Array]
-"""Heights, what was lost, and what is being carried (quanta), while sand moves on from under a tool cell by cell."""
-
-
-def none_carried(params: Any, k: jax.Array, state: Carried) -> jax.Array:
-    """Whether no sand is being carried any more."""
-    return ~jnp.any(state[2] > 0)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Job:
-    """What every part of a push needs.
+class Carried:
+    """Sand that moves on from under a tool, cell by cell (quanta).
+
+    Attributes:
+        height: of each cell.
+        lost: what each has lost over a rim, or None where the edge is closed.
+        carried: what is still being carried.
+    """
+
+    height: jax.Array
+    lost: jax.Array | None
+    carried: jax.Array
+
+
+def none_carried(params: Tree, k: jax.Array, state: Carried) -> jax.Array:
+    """Whether no sand is being carried any more."""
+    return ~jnp.any(state.carried > 0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Site:
+    """A tool at the start of a leg, and the bed that it moves over: what every part of a push needs.
 
     Attributes:
         bed: spacing, largest stable steps and rim.
@@ -54,11 +68,11 @@ class Job:
     room: Float[Array, ""] | None = None
 
 
-def take(job: Job, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[jax.Array, jax.Array]:
+def take(site: Site, h: jax.Array, before: jax.Array, cover: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The height left and the height taken of each cell, as the footprint grows from `before` to `cover`."""
     grown = cover > before
     share = jnp.where(grown, (cover - before) / jnp.where(grown, 1 - before, 1), 0)
-    taken = whole(job, share * jnp.where(h > job.bottom, h - job.bottom, 0))
+    taken = whole(site, share * jnp.where(h > site.bottom, h - site.bottom, 0))
     return h - taken, taken
 
 
@@ -73,21 +87,23 @@ def shares(p: jax.Array, q: jax.Array) -> Shares:
     return [rows[di] * columns[dj] + (stay if di == 0 or dj == 0 else 0) for di, dj in EIGHT]
 
 
-def contact(job: Job, cover: jax.Array, h: jax.Array) -> jax.Array:
+def contact(site: Site, cover: jax.Array, h: jax.Array) -> jax.Array:
     """How much the blade is in contact with sand: 1 in the sand, falling to 0 a spacing above it or where it covers no cell.
 
     Rates are multiplied by it, so that a tool that touches nothing moves no sand that is still only to a tolerance.
     """
-    above = jnp.where(jnp.isnan(h), -jnp.inf, h) - job.bottom
-    near = jnp.clip(1 + jnp.maximum(above, -job.bed.spacing) / job.bed.spacing, 0, 1)
+    above = jnp.where(jnp.isnan(h), -jnp.inf, h) - site.bottom
+    near = jnp.clip(1 + jnp.maximum(above, -site.bed.spacing) / site.bed.spacing, 0, 1)
     return jnp.minimum(1, 2 * jnp.max(jnp.max(near * cover, axis=0)))
 
 
-def settle_around(job: Job, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: Lost) -> tuple[jax.Array, Lost]:
+def settle_around(
+    site: Site, flow: Flow, sweeps: int, cover: jax.Array, h: jax.Array, lost: ExactSum | None
+) -> tuple[jax.Array, ExactSum | None]:
     """The height and the losses after some sweeps of the sand around a blade whose footprint is `cover`."""
-    return repeat(Beside(sweeps), 1, (job.bed, flow, stand(cover, job.bottom)), (h, lost))
+    return repeat(Beside(sweeps), 1, (site.bed, flow, tool_in_sand(cover, site.bottom)), (h, lost))
 
 
-def whole(job: Job, amount: jax.Array) -> jax.Array:
+def whole(site: Site, amount: jax.Array) -> jax.Array:
     """The amount (m) cut to whole quanta."""
-    return truncate(amount / job.flow.quantum) * job.flow.quantum
+    return truncate(amount / site.flow.quantum) * site.flow.quantum

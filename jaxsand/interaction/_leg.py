@@ -8,11 +8,10 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from jaxsand.autodiff.while_loop import Step as LoopStep
-from jaxsand.autodiff.while_loop import Tree, repeat, repeat_until
-from jaxsand.interaction._advance import Step
+from jaxsand.autodiff.while_loop import Step, Tree, repeat, repeat_until
+from jaxsand.interaction._advance import LegStep
 from jaxsand.interaction._block import Block, Moving, Way
-from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._displacement import Site
 from jaxsand.interaction._frame import Frame, frame_of
 from jaxsand.interaction._kept import Kept, Laid, lay, seen
 from jaxsand.interaction._path import State, over_the_map, turn_between
@@ -22,7 +21,7 @@ from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, Pose, reach
 
 
-class Repeated(LoopStep, Protocol):
+class Repeated(Step, Protocol):
     """A step that is repeated until it is done."""
 
     @property
@@ -42,7 +41,7 @@ class Repeated(LoopStep, Protocol):
 
 
 @dataclass(frozen=True)
-class Steps:
+class LegSteps:
     """What a tool does on a leg.
 
     Attributes:
@@ -52,13 +51,13 @@ class Steps:
         bound: largest length of a leg (spacings).
     """
 
-    lower: Step
+    lower: LegStep[Any]
     turn: Repeated
     ahead: Repeated
     bound: float
 
 
-Params = Callable[[Job, Pose, jax.Array, jax.Array], Tree]  # of a pose, the length of a leg (m), the angle before it (rad)
+Params = Callable[[Site, Pose, jax.Array, jax.Array], Tree]  # of a pose, the length of a leg (m), the angle before it (rad)
 
 
 def chunk(substep: float) -> int:
@@ -67,10 +66,17 @@ def chunk(substep: float) -> int:
 
 
 def moved(
-    scene: Scene, job: Job, steps: Steps, params: Params, pose: Pose, length: jax.Array, before: Pose | None, state: State
+    scene: Scene,
+    site: Site,
+    steps: LegSteps,
+    params: Params,
+    pose: Pose,
+    length: jax.Array,
+    before: Pose | None,
+    state: State,
 ) -> State:
     """Lowers the tool, or turns it from the pose before, and moves it ahead by `length` (m), skipping parts off the map."""
-    shape, dx, block, substep = scene.grid.shape, job.bed.spacing, steps.ahead.block, steps.ahead.substep
+    shape, dx, block, substep = scene.grid.shape, site.bed.spacing, steps.ahead.block, steps.ahead.substep
     kept = state.kept
     none = no_flux(block.neighbours, block.drains, jnp.zeros((block.size, block.size), state.height.dtype))
     flat, gone = jax.tree.map(lambda x: x.reshape(-1), (state.height, state.lost))
@@ -78,12 +84,12 @@ def moved(
     zero = jnp.zeros_like(length)
     nowhere = Laid(none, jnp.int32(0), jnp.int32(0))
     if before is None:
-        sand = repeat(steps.lower, 1, params(job, pose, zero, zero), sand)
+        sand = repeat(steps.lower, 1, params(site, pose, zero, zero), sand)
         kept = Kept(nowhere, nowhere, zero, zero)
     else:
         assert isinstance(kept, Kept)
-        sand, kept = _turned(job, steps, params, shape, pose, before, kept, sand)
-    there, start, onmap = over_the_map(scene, job, pose, length)
+        sand, kept = _turned(site, steps, params, shape, pose, before, kept, sand)
+    there, start, onmap = over_the_map(scene, site, pose, length)
     stride = chunk(substep) * substep
     bound = math.ceil(steps.bound / stride) + 1
     frame = frame_of(shape, _in_spacings(start, dx))
@@ -106,17 +112,17 @@ def moved(
 
 
 def _turned(
-    job: Job, steps: Steps, params: Params, shape: tuple[int, int], pose: Pose, before: Pose, kept: Kept, sand: Moving
+    site: Site, steps: LegSteps, params: Params, shape: tuple[int, int], pose: Pose, before: Pose, kept: Kept, sand: Moving
 ) -> tuple[Moving, Kept]:
     """Turns the tool in place from the pose before, which is at the leg's start already (see `along_legs`)."""
-    dx, block, no = job.bed.spacing, steps.turn.block, jnp.zeros((), bool)
+    dx, block, no = site.bed.spacing, steps.turn.block, jnp.zeros((), bool)
     angle = turn_between(before, pose)
     frame = Frame(_in_spacings(before, dx), no, no, no, shape)
     first = block.corner(frame.pose.x, frame.pose.y)
     sense = jnp.sign(angle)
-    alike = jnp.where(sense * kept.sense < 0, 0, jnp.clip(1 - kept.since * dx / reach(job.tool), 0, 1))
+    alike = jnp.where(sense * kept.sense < 0, 0, jnp.clip(1 - kept.since * dx / reach(site.tool), 0, 1))
     flux = _times(alike, seen(block, frame, first, kept.turned))
-    turn = params(job, before, jnp.zeros_like(angle), angle)
+    turn = params(site, before, jnp.zeros_like(angle), angle)
     bound = math.ceil(math.pi * math.hypot(*shape) / steps.turn.substep) + 1
     sand, _ = repeat_until(steps.turn.done, steps.turn, bound, turn, replace(sand, flux=flux))
     turns = sense != 0
@@ -128,26 +134,26 @@ def _turned(
     )
 
 
-def way_of(job: Job, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.Array, side: jax.Array) -> Way:
+def way_of(site: Site, pose: Pose, length: jax.Array, angle: jax.Array, half: jax.Array, side: jax.Array) -> Way:
     """A leg in spacings, of a tool that reaches by `half` ahead and by `side` aside (spacings); see `Way`."""
-    dx, drop, rim = job.bed.spacing, job.bed.drop, job.bed.rim
-    yaw, plates = (job.tool.yaw, job.tool.plates) if isinstance(job.tool, Blade) else (None, None)
+    dx, drop, rim = site.bed.spacing, site.bed.drop, site.bed.rim
+    yaw, plates = (site.tool.yaw, site.tool.plates) if isinstance(site.tool, Blade) else (None, None)
     return Way(
         _in_spacings(pose, dx),
         length / dx,
         half,
         side,
-        job.bottom,
+        site.bottom,
         dx,
-        job.flow.quantum,
+        site.flow.quantum,
         drop.reshape(-1) if drop.ndim else drop,
         None if rim is None else rim.level,
-        job.flow.rate,
+        site.flow.rate,
         angle,
-        None if job.rise is None else job.rise * dx,
-        None if job.room is None else job.room / job.flow.quantum,
+        None if site.rise is None else site.rise * dx,
+        None if site.room is None else site.room / site.flow.quantum,
         None if yaw is None else jnp.asarray(yaw),
-        None if job.bed.base is None else job.bed.base.reshape(-1),
+        None if site.bed.base is None else site.bed.base.reshape(-1),
         None if plates is None else plates / dx,
     )
 

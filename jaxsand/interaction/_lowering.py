@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._advance import Step
+from jaxsand.interaction._advance import LegStep
 from jaxsand.interaction._block import Moving, Way, normal_of
 from jaxsand.interaction._displacement import Carried, none_carried
 from jaxsand.interaction._frame import frame_of
@@ -19,7 +19,7 @@ Params: TypeAlias = tuple[blade.Shares, jax.Array, jax.Array, tuple[jax.Array, j
 
 
 @dataclass(frozen=True)
-class Lower(Step):
+class Lower(LegStep[Way]):
     """The step in which the blade comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1
@@ -49,9 +49,9 @@ class Lower(Step):
         gone = None if over is None else jnp.zeros_like(old)
         params = (shares, holds, cover, over)
         into, scooped = blade.scooped(way.room, sand.scooped, taken)
-        state = (old - taken, gone, taken - into)
-        (new, gone, carried), _ = repeat_until(none_carried, Plain(_spread, 16), 2 * self.block.near, params, state)
-        new = self.block.put(whole, new + carried)
+        state = Carried(old - taken, gone, taken - into)
+        state, _ = repeat_until(none_carried, Plain(_spread, 16), 2 * self.block.near, params, state)
+        gone, new = state.lost, self.block.put(whole, state.height + state.carried)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, whole, new, cover))
         lost = self.block.lose(way, view, sand.lost, None if gone is None else self.block.put(jnp.zeros_like(whole), gone))
         return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge, scooped)
@@ -60,8 +60,8 @@ class Lower(Step):
 def _spread(params: Params, k: jax.Array, state: Carried) -> Carried:
     """Moves the carried sand by one cell: it stays in the open share of cells, and is carried on in the covered share."""
     shares, holds, cover, over = params
-    h, gone, carried = state
-    free = None if over is None else (over[0], over[1] * carried)
-    kept, got, lost = blade.handed_on(shares, holds, carried, free)
+    free = None if over is None else (over[0], over[1] * state.carried)
+    kept, got, lost = blade.handed_on(shares, holds, state.carried, free)
     rest = truncate((1 - cover) * got)
-    return h + rest + kept, None if gone is None or lost is None else gone + lost, got - rest
+    h = state.height + rest + kept
+    return Carried(h, None if state.lost is None or lost is None else state.lost + lost, got - rest)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._displacement import Site
 from jaxsand.interaction._mound import Holds, distance
 from jaxsand.interaction._shade import between, inside, spot
 from jaxsand.scene.scene import Scene
@@ -18,7 +18,7 @@ from jaxsand.scene.tools import Pose
 
 
 @dataclass(frozen=True)
-class Rim:
+class RimAhead:
     """A draining edge, as a blade's leg meets it.
 
     Attributes:
@@ -38,11 +38,11 @@ class Rim:
     seen: jax.Array
 
     @classmethod
-    def of(cls, scene: Scene, job: Job, ground: jax.Array, sand: jax.Array, seen: jax.Array) -> "Rim":
+    def of(cls, scene: Scene, site: Site, ground: jax.Array, sand: jax.Array, seen: jax.Array) -> "RimAhead":
         """The rim of a scene that drains, before the leg."""
-        assert job.bed.rim is not None
-        dx, (rows, columns) = job.bed.spacing, scene.grid.shape
-        return cls((columns * dx, rows * dx), job.bed.rim.level, ground, jnp.ones(2, sand.dtype), _from_edge(sand), seen)
+        assert site.bed.rim is not None
+        dx, (rows, columns) = site.bed.spacing, scene.grid.shape
+        return cls((columns * dx, rows * dx), site.bed.rim.level, ground, jnp.ones(2, sand.dtype), _from_edge(sand), seen)
 
     def outside(self, pose: Pose, s: jax.Array, n: jax.Array, seen: jax.Array, dx: jax.Array) -> jax.Array:
         """1 at points beyond the edge, smoothed over a spacing, if the cells on this side are `seen`.
@@ -85,9 +85,9 @@ class Rim:
 
         return holds
 
-    def room(self, job: Job, h: jax.Array, mu: jax.Array) -> jax.Array:
+    def room(self, site: Site, h: jax.Array, mu: jax.Array) -> jax.Array:
         """How much higher than h sand can stand (m): at the distance r from the rim, up to mu r above the rim."""
-        return jnp.maximum(self.level + mu * self.away * job.bed.spacing - jnp.where(jnp.isnan(h), 0, h), 0)
+        return jnp.maximum(self.level + mu * self.away * site.bed.spacing - jnp.where(jnp.isnan(h), 0, h), 0)
 
 
 def _from_edge(sand: jax.Array) -> jax.Array:

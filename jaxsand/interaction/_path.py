@@ -10,10 +10,10 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.interaction._displacement import Job
+from jaxsand.interaction._displacement import Site
 from jaxsand.relaxation.flux import worst_excess
 from jaxsand.relaxation.ghost_cells import (
-    Lost,
+    ExactSum,
     below_base,
     halo,
     largest,
@@ -75,13 +75,13 @@ class State:
     """
 
     height: jax.Array
-    lost: Lost
+    lost: ExactSum | None
     moved: jax.Array
     kept: Tree
-    scooped: Lost
+    scooped: ExactSum | None
 
 
-Leg = Callable[[Job, Pose, jax.Array, Pose | None, State], State]
+Leg = Callable[[Site, Pose, jax.Array, Pose | None, State], State]
 Record = Callable[[jax.Array], Tree]  # what to note of the height [H, W] (m) after each leg
 
 
@@ -113,18 +113,18 @@ def travelled(
     *,
     rises: bool = False,
     room: jax.Array | None = None,
-) -> tuple[Pushed, Tree, Lost]:
+) -> tuple[Pushed, Tree, ExactSum | None]:
     """Lowers the tool at path[0], moves it along the legs of `path` (m) and lifts it.
 
-    `leg(job, pose, length, before, state)` moves the tool from `pose` by `length` (m). `before` is the tool's pose at the
+    `leg(site, pose, length, before, state)` moves the tool from `pose` by `length` (m). `before` is the tool's pose at the
     end of the last leg, or None if the tool is yet to be lowered. Without a tool the map stays as it is.
 
     The path is [n, 2], at the tool's own depth, or [n, 3] with heights of the tool's lowest point, if `rises` says that the
-    leg heeds `job.rise`. A leg straight up or down leaves the map as it is, and the outcome says NOT_FINITE. A bucket can
+    leg heeds `site.rise`. A leg straight up or down leaves the map as it is, and the outcome says NOT_FINITE. A bucket can
     take up a sum of heights of `room` (m).
 
     Returns the map after the path, what `record(height)` returned after each leg, stacked, and the sum of heights (m) that a
-    bucket took up, as an account (low, high).
+    bucket took up, as an account.
     """
     if path.shape[1] == 3 and not rises:
         raise ValueError(
@@ -144,21 +144,21 @@ def travelled(
     deep = extent(scene.tool, heights)
     scale = 4 * (jnp.maximum(largest(intact), bed.elsewhere) + jnp.where(usable, deep, 0))
     flow = Flow(jnp.asarray(rate), quantum(scale))
-    job = Job(
+    site = Site(
         bed, *centres(scene.grid, height.dtype), tool, jnp.where(usable, lowest(scene.tool), jnp.inf), None, flow, room
     )
     lost = nothing_lost(bed, height)
-    moved = jnp.zeros_like(job.bottom)
+    moved = jnp.zeros_like(site.bottom)
     if isinstance(scene.window, Window):
         moved = lax.stop_gradient(worst_excess(bed, halo(intact)))
-    zero = jnp.zeros_like(job.bottom)
-    state = State(intact, lost, moved, (), None if room is None else (zero, zero))
+    zero = jnp.zeros_like(site.bottom)
+    state = State(intact, lost, moved, (), None if room is None else ExactSum(zero, zero))
 
-    def at_height(start: jax.Array, stop: jax.Array, length: jax.Array) -> Job:
+    def at_height(start: jax.Array, stop: jax.Array, length: jax.Array) -> Site:
         if not start.size:
-            return job
+            return site
         rise = (stop[0] - start[0]) / jnp.where(length > 0, length, 1)
-        return replace(job, bottom=jnp.where(usable, start[0], jnp.inf), rise=rise)
+        return replace(site, bottom=jnp.where(usable, start[0], jnp.inf), rise=rise)
 
     pose, length = heading(path[0], path[1], None)
     state = leg(at_height(heights[0], heights[1], length), pose, length, None, state)
@@ -167,8 +167,8 @@ def travelled(
     def later_leg(carry: tuple[Pose, State], points: tuple[jax.Array, ...]) -> tuple[tuple[Pose, State], Tree]:
         before, state = carry
         pose, length = heading(points[0], points[1], before)
-        job = at_height(points[2], points[3], length)
-        state = leg(job, pose, length, Pose(pose.x, pose.y, before.cos, before.sin), state)
+        site = at_height(points[2], points[3], length)
+        state = leg(site, pose, length, Pose(pose.x, pose.y, before.cos, before.sin), state)
         return (pose, state), record(unmark(state.height, height)) if record else ()
 
     if path.shape[0] > 2:
@@ -207,15 +207,15 @@ def upright(path: jax.Array) -> jax.Array:
     return jnp.all(path[1:, :2] == path[:-1, :2], axis=1) & jnp.any(path[1:, 2:] != path[:-1, 2:], axis=1)
 
 
-def over_the_map(scene: Scene, job: Job, pose: Pose, length: jax.Array) -> tuple[Job, Pose, jax.Array]:
-    """The part of a leg on which the tool can touch the map: the job and the pose where it starts, and its length (m)."""
-    dx = job.bed.spacing
-    along = corners(scene, job, pose)
-    far = reach(job.tool) + dx
+def over_the_map(scene: Scene, site: Site, pose: Pose, length: jax.Array) -> tuple[Site, Pose, jax.Array]:
+    """The part of a leg on which the tool can touch the map: the site and the pose where it starts, and its length (m)."""
+    dx = site.bed.spacing
+    along = corners(scene, site, pose)
+    far = reach(site.tool) + dx
     first = jnp.clip(along[0] - far, 0, length)
     last = jnp.clip(along[1] + far, first, length)
     start = Pose(pose.x + first * pose.cos, pose.y + first * pose.sin, pose.cos, pose.sin)
-    return job if job.rise is None else replace(job, bottom=job.bottom + first * job.rise), start, last - first
+    return site if site.rise is None else replace(site, bottom=site.bottom + first * site.rise), start, last - first
 
 
 def turn_between(before: Pose, after: Pose) -> jax.Array:
@@ -226,10 +226,10 @@ def turn_between(before: Pose, after: Pose) -> jax.Array:
     return jnp.where(same, 0, jnp.arctan2(jnp.where(same, 0, sin), jnp.where(same, 1, cos)))
 
 
-def corners(scene: Scene, job: Job, pose: Pose) -> tuple[jax.Array, jax.Array]:
+def corners(scene: Scene, site: Site, pose: Pose) -> tuple[jax.Array, jax.Array]:
     """The least and the largest distance of the map's corners along a heading, from the pose (m)."""
     rows, columns = scene.grid.shape
-    dx = job.bed.spacing
+    dx = site.bed.spacing
     along = [local(pose, x * dx, y * dx)[0] for x in (0, columns) for y in (0, rows)]
     least = jnp.minimum(jnp.minimum(*along[:2]), jnp.minimum(*along[2:]))
     return least, jnp.maximum(jnp.maximum(*along[:2]), jnp.maximum(*along[2:]))

@@ -67,7 +67,7 @@ def rest_taped(model: Links, sweeps: int, h: jax.Array, guess: Fluxes, tape: Tap
     return lax.fori_loop(0, sweeps, stage, (guess, tape))[1]
 
 
-def rest_pulled(
+def rest_vjp(
     model: Links, sweeps: int, part: Callable[[jax.Array], jax.Array], tape: Tape, cotangent: tuple[jax.Array, Fluxes]
 ) -> Rested:
     """The cotangents, from those of the heights and the fluxes in the end; `part` cuts a map to what is near the tool."""
@@ -86,21 +86,21 @@ def rest_pulled(
         # What was taped is part of what is carried: XLA would fetch it anew for all that uses it.
         taped, gain, psi, of_gates, of_most, of_stretch, lift, work = carry
         here, taped, psi = lax.optimization_barrier((model, taped, psi))
-        sand, around, ways = here.sand, taped.surface, taped.way
+        sand, surface, ways = here.sand, taped.surface, taped.way
         moved = [jnp.where(way == 0, 0, p) for way, p in zip(ways, psi, strict=True)]
         driven = tuple(y * (g * c) for y, g, c in zip(moved, sand.gates, here.factors, strict=True))
-        lifted = inner(around) > sand.bottom
+        lifted = inner(surface) > sand.bottom
         slope = 1 + jnp.where(lifted, sand.stretch, 0)
         change = outer(-net(neighbours, driven) * slope)
         back = tuple(y - d for y, d in zip(moved, rises(neighbours, change), strict=True))
         of_surface = inner(change) / slope
-        above = inner(around) - jnp.where(jnp.isfinite(sand.bottom), sand.bottom, 0)
-        work = work + of_surface * (inner(around) - jnp.where(jnp.isfinite(one_height), one_height, 0))
+        above = inner(surface) - jnp.where(jnp.isfinite(sand.bottom), sand.bottom, 0)
+        work = work + of_surface * (inner(surface) - jnp.where(jnp.isfinite(one_height), one_height, 0))
         raised = jnp.where(part(lifted), part(of_surface), 0)
         of_stretch, lift = of_stretch + raised * part(above), lift + raised
         signed = [way.astype(p.dtype) * p * g for way, p, g in zip(ways, psi, sand.gates, strict=True)]
         of_most = of_most + sum(y[: gain.shape[0], : gain.shape[1]] for y in signed)  # the last row and column are closed
-        near = zip(of_gates, ways, moved, rises(neighbours, around), here.factors, strict=True)
+        near = zip(of_gates, ways, moved, rises(neighbours, surface), here.factors, strict=True)
         of_gates = tuple(
             old + part(y) * (c * part(rise) - part(way).astype(y.dtype) * here.most) for old, way, y, rise, c in near
         )

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,44 +9,44 @@ from jax import lax
 
 from jaxsand.autodiff.while_loop import Plain, repeat_until
 from jaxsand.interaction import _wheel as wheel
-from jaxsand.interaction._advance import Step
+from jaxsand.interaction._advance import LegStep
 from jaxsand.interaction._block import Block, Moving, View, pose_ahead, rotated
 from jaxsand.interaction._displacement import Carried, none_carried
 from jaxsand.interaction._frame import Frame, frame_of, shifted
-from jaxsand.interaction._wheel import Stand, Track
+from jaxsand.interaction._wheel import Placed, Track
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import at, truncate
 from jaxsand.scene.tools import Pose
 
-Sanded = tuple[jax.Array, Fluxes, jax.Array | None]  # heights, fluxes and what was lost (quanta)
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class AtRest:
+    """Sand that was brought to rest in a block (quanta): heights, fluxes, and what each cell lost over a rim, or None."""
+
+    height: jax.Array
+    flux: Fluxes
+    lost: jax.Array | None
 
 
 @dataclass(frozen=True)
-class _OfWheel(Step):
-    """A step whose params are a wheel's track."""
-
-    def work(self, way: Any) -> jax.Array:
-        return super().work(way.way)
-
-
-@dataclass(frozen=True)
-class Touchdown(_OfWheel):
+class Touchdown(LegStep[Track]):
     """The step in which the wheel comes down: the sand that it covers moves outwards, cell by cell, until it has left."""
 
     tape: int = 1
 
-    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
         way, frame = track.way, frame_of(self.block.shape, track.way.start)
         first = self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
-        here = wheel.stand(self.block, track, frame, first, view)
+        here = wheel.placed(self.block, track, frame, first, view)
         taken = truncate(here.cover * jnp.maximum(old - here.rim, 0)) * at(view.holds)
         gone = None if view.beyond is None else jnp.zeros_like(old)
         onward = Plain(_Onward(self.block), 16)
         params = (track, view, wheel.radial(track, frame, here), here)
-        (new, gone, carried), _ = repeat_until(none_carried, onward, 2 * self.block.size, params, (old - taken, gone, taken))
-        new = new + carried
+        state, _ = repeat_until(none_carried, onward, 2 * self.block.size, params, Carried(old - taken, gone, taken))
+        gone, new = state.lost, state.height + state.carried
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, here.cover))
         lost = self.block.lose(way, view, sand.lost, gone)
         return Moving(self.block.back(way, view, sand.height, new), lost, sand.flux, edge)
@@ -59,13 +58,13 @@ class _Onward:
 
     block: Block
 
-    def __call__(self, params: tuple[Track, View, wheel.Shares, Stand], k: jax.Array, state: Carried) -> Carried:
+    def __call__(self, params: tuple[Track, View, wheel.Shares, Placed], k: jax.Array, state: Carried) -> Carried:
         track, view, shares, here = params
         return wheel.handed_on(self.block, track, view, shares, here, state)
 
 
 @dataclass(frozen=True)
-class _Moved(_OfWheel):
+class _Moved(LegStep[Track]):
     """A step in which the wheel moves, and `sweeps` proximal steps after each sub-step bring the sand to rest around it."""
 
     substep: float = 0.125
@@ -76,22 +75,22 @@ class _Moved(_OfWheel):
         track: Track,
         view: View,
         shares: wheel.Shares,
-        now: Stand,
+        now: Placed,
         part: jax.Array,
         h: jax.Array,
         flux: Fluxes,
         taken: jax.Array,
-    ) -> Sanded:
+    ) -> AtRest:
         """The sand after what was taken up has left the wheel's new place `now`, and was brought to rest around it."""
         h, gone = wheel.displaced(self.block, track, view, shares, now, h - taken, taken)
-        around, among = wheel.around(self.block, track, view, now, h)
-        guess = self.block.guess(around.gates, among * part, flux)
-        h, new = bring_to_rest(around, track.way.rate * among * part, self.sweeps, h, guess)
-        return h, self.kept(part, new, flux), None if gone is None else gone + new[-1]
+        beside, among = wheel.sand_beside(self.block, track, view, now, h)
+        guess = self.block.guess(beside.gates, among * part, flux)
+        h, new = bring_to_rest(beside, track.way.rate * among * part, self.sweeps, h, guess)
+        return AtRest(h, self.kept(part, new, flux), None if gone is None else gone + new[-1])
 
 
 @dataclass(frozen=True)
-class Turn(_Moved):
+class WheelTurn(_Moved):
     """A sub-step of a turn in place, which moves the wheel's corners by `substep` spacings."""
 
     def done(self, track: Track, k: jax.Array, _: Moving) -> jax.Array:
@@ -103,7 +102,7 @@ class Turn(_Moved):
         far = jnp.minimum(jnp.hypot(track.radius, track.way.side), math.hypot(*self.block.shape))
         return self.substep / far
 
-    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
         way, whole = track.way, self._part(track)
         begin = k.astype(whole.dtype) * whole
         ahead = jnp.clip(jnp.abs(way.angle) - begin, 0, whole)
@@ -113,13 +112,14 @@ class Turn(_Moved):
         after = replace(frame, pose=rotated(way.start, sign * (begin + ahead)))
         first = self.block.corner(frame.pose.x, frame.pose.y)
         view, old = self.block.view(way, frame, first, sand.height)
-        before, now = (wheel.stand(self.block, track, f, first, view) for f in (frame, after))
+        before, now = (wheel.placed(self.block, track, f, first, view) for f in (frame, after))
         taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, old), 0) * at(view.holds)
         shares = wheel.turning(track, frame, before, sign)
-        new, flux, gone = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
+        state = self.moved(track, view, shares, now, ahead / whole, old, sand.flux, taken)
         cover = jnp.maximum(before.cover, now.cover)
-        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, cover))
-        return Moving(self.block.back(way, view, sand.height, new), self.block.lose(way, view, sand.lost, gone), flux, edge)
+        edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, state.height, cover))
+        height = self.block.back(way, view, sand.height, state.height)
+        return Moving(height, self.block.lose(way, view, sand.lost, state.lost), state.flux, edge)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Roll(_Moved):
         steps = (k - int(self.lowered)).astype(track.way.length.dtype)
         return (k >= int(self.lowered)) & jnp.all(steps * (self.chunk * self.substep) >= track.way.length)
 
-    def __call__(self, track: Any, k: jax.Array, sand: Moving) -> Moving:
+    def __call__(self, track: Track, k: jax.Array, sand: Moving) -> Moving:
         way, block = track.way, self.block
         frame = frame_of(block.shape, way.start)
         first, by = block.ahead(frame, way.length, k - int(self.lowered), self.chunk * self.substep)
@@ -145,10 +145,10 @@ class Roll(_Moved):
         flux = shifted(sand.flux, by) if block.follows else sand.flux
         gone = None if view.beyond is None else jnp.zeros_like(old)
 
-        def substep(i: jax.Array, state: Sanded) -> Sanded:
-            h, flux, gone = state
+        def substep(i: jax.Array, state: AtRest) -> AtRest:
+            h, flux, gone = state.height, state.flux, state.lost
             (begin, end), ahead = self._ends(track, k, i)
-            before, now = (wheel.stand(block, track.at(by), _at(frame, by), first, view) for by in (begin, end))
+            before, now = (wheel.placed(block, track.at(by), _at(frame, by), first, view) for by in (begin, end))
             taken = jnp.where(ahead > 0, wheel.cleared(track, before, now, h), 0) * at(view.holds)
             h, left = wheel.carried_back(block, track, _at(frame, end), first, view, ahead, h, taken)
             h = h - taken + left
@@ -156,14 +156,15 @@ class Roll(_Moved):
             part = jnp.where(still, 1, ahead / self.substep)
             flux = tuple(jnp.where(still, 0, f) for f in flux)
             shares = wheel.leaving(track, frame, now)
-            h, flux, more = self.moved(track.at(end), view, shares, now, part, h, flux, left)
-            return h, flux, gone if gone is None or more is None else gone + more
+            state = self.moved(track.at(end), view, shares, now, part, h, flux, left)
+            return replace(state, lost=gone if gone is None or state.lost is None else gone + state.lost)
 
-        new, flux, gone = lax.fori_loop(0, self.chunk, substep, (old, flux, gone))
+        state = lax.fori_loop(0, self.chunk, substep, AtRest(old, flux, gone))
         ends = self._ends(track, k, jnp.int32(0))[0][0], self._ends(track, k, jnp.int32(self.chunk - 1))[0][1]
-        cover = jnp.maximum(*(wheel.stand(block, track, _at(frame, by), first, view).cover for by in ends))
-        edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, new, cover))
-        return Moving(block.back(way, view, sand.height, new), block.lose(way, view, sand.lost, gone), flux, edge)
+        cover = jnp.maximum(*(wheel.placed(block, track, _at(frame, by), first, view).cover for by in ends))
+        edge = jnp.maximum(sand.edge, block.touched(way, frame, first, old, state.height, cover))
+        height = block.back(way, view, sand.height, state.height)
+        return Moving(height, block.lose(way, view, sand.lost, state.lost), state.flux, edge)
 
     def _ends(self, track: Track, k: jax.Array, i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         """How far ahead the wheel is before and after sub-step i of step k, and the distance between them (spacings)."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsand.interaction import _blade as blade
-from jaxsand.interaction._advance import Rest, Step
+from jaxsand.interaction._advance import LegStep, Rest
 from jaxsand.interaction._block import Moving, Way, normal_of, rotated
 from jaxsand.interaction._frame import Frame
 from jaxsand.interaction.resting import bring_to_rest
@@ -16,7 +16,7 @@ from jaxsand.relaxation.ghost_cells import at
 
 
 @dataclass(frozen=True)
-class Turn(Step):
+class BladeTurn(LegStep[Way]):
     """A sub-step of a turn in place, which moves the blade's corners by `substep` spacings."""
 
     substep: float = 0.125
@@ -51,10 +51,10 @@ class Turn(Step):
         taken = jnp.where(ahead > 0, blade.cleared(reach, self.block.part(old), bottom), 0)
         face = blade.facing(at(now[1]), sign * ahead) / jnp.maximum(jnp.abs(pose.cos), jnp.abs(pose.sin))
         h, lost = self.block.displaced(way, view, blade.any_way(face * pose.cos, face * pose.sin), old, taken)
-        near = self.block.around(view, reach)
-        around = self.block.sand(replace(way, bottom=bottom * way.quantum), view, self.block.clear(view), near)
+        near = self.block.beside(view, reach)
+        beside = self.block.sand(replace(way, bottom=bottom * way.quantum), view, self.block.clear(view), near)
         guess = self.block.guess(near.gates, part, sand.flux)
-        new, flux = self.rest(around, way.rate * among * part, self.sweeps, h, guess)
+        new, flux = self.rest(beside, way.rate * among * part, self.sweeps, h, guess)
         gone = None if lost is None else lost + flux[-1]
         flux = self.kept(part, flux, sand.flux)
         edge = jnp.maximum(sand.edge, self.block.touched(way, frame, first, old, new, at(reach.swept)))

@@ -19,6 +19,7 @@ from jax import lax
 
 from jaxsand.interaction import _blade as blade
 from jaxsand.interaction._block import Block, First, View, Way
+from jaxsand.interaction._displacement import Carried
 from jaxsand.interaction._frame import Frame
 from jaxsand.interaction.resting import Sand
 from jaxsand.interaction.stencil import inner, outer, seen, spread
@@ -56,6 +57,16 @@ class Track:
         level = self.way.rise is None and self.way.relief is None
         return self if level else replace(self, way=self.way.at(by))
 
+    @property
+    def length(self) -> jax.Array:
+        """Length of the leg (spacings)."""
+        return self.way.length
+
+    @property
+    def angle(self) -> jax.Array:
+        """Angle by which the wheel turns in place before the leg (rad)."""
+        return self.way.angle
+
     def seen(self, frame: Frame) -> jax.Array:
         """The slip angle in a frame, where a mirror changes its sign."""
         return frame.mirrors(self.slip)
@@ -63,7 +74,7 @@ class Track:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Stand:
+class Placed:
     """A wheel in a block, maps [m, m].
 
     Attributes:
@@ -84,7 +95,7 @@ class Stand:
         return self.lengthwise * self.crosswise
 
 
-def stand(block: Block, track: Track, frame: Frame, first: First, view: View) -> Stand:
+def placed(block: Block, track: Track, frame: Frame, first: First, view: View) -> Placed:
     """The wheel at the frame's pose, with its rim no lower than the floor under the sand.
 
     At the distance a from the axle its rim stands r - sqrt(r^2 - a^2) above its lowest point. The footprint is smoothed like
@@ -98,10 +109,10 @@ def stand(block: Block, track: Track, frame: Frame, first: First, view: View) ->
     square = jnp.where(jnp.abs(a) < 0.999 * r, r * r - a * a, 0.002 * r * r)
     rim = (r - jnp.sqrt(square)) * spread(way.spacing / way.quantum, s) + spread(way.bottom / way.quantum, s)
     rim = block.above(view, rim)
-    return lax.optimization_barrier(Stand(a, c, blade.share(a, -r, r), blade.share(c, -side, side), rim))
+    return lax.optimization_barrier(Placed(a, c, blade.share(a, -r, r), blade.share(c, -side, side), rim))
 
 
-def cleared(track: Track, old: Stand, new: Stand, h: jax.Array) -> jax.Array:
+def cleared(track: Track, old: Placed, new: Placed, h: jax.Array) -> jax.Array:
     """The sand that has to leave the cells of a block as the wheel moves from `old` to `new`, in whole quanta.
 
     Sand above the rim stood in the open share of its cell, a part of which the wheel now sweeps. Sand that is still inside
@@ -122,7 +133,7 @@ def _swept(old: jax.Array, new: jax.Array, half: jax.Array) -> jax.Array:
     return jnp.clip(far + half + 0.5, 0, 1) - jnp.clip(near - half + 0.5, 0, 1)
 
 
-def leaving(track: Track, frame: Frame, wheel: Stand) -> Shares:
+def leaving(track: Track, frame: Frame, wheel: Placed) -> Shares:
     """The shares of the four neighbours for displacement by a wheel that moves ahead.
 
     As components (along the wheel's plane, along its axle), with u from -1 at one flank to 1 at the other, sand leaves the
@@ -139,14 +150,14 @@ def leaving(track: Track, frame: Frame, wheel: Stand) -> Shares:
     return _shares(p, q, jnp.ones_like(p))
 
 
-def turning(track: Track, frame: Frame, wheel: Stand, way: jax.Array) -> Shares:
+def turning(track: Track, frame: Frame, wheel: Placed, way: jax.Array) -> Shares:
     """The shares of the four neighbours for a turn in place, counter-clockwise where `way` is 1: along the axle."""
     forward = jnp.clip(wheel.along, -1, 1) * way
     p, q = _on_the_map(track, frame, jnp.zeros_like(forward), forward)
     return _shares(p, q, jnp.abs(forward))
 
 
-def radial(track: Track, frame: Frame, wheel: Stand) -> Shares:
+def radial(track: Track, frame: Frame, wheel: Placed) -> Shares:
     """The shares of the four neighbours for displacement away from the wheel's centre, as the wheel is lowered.
 
     The direction is the gradient of (along / chord)^2 + (aside / width)^2; within a cell of the centre it has less weight.
@@ -182,32 +193,29 @@ def handed_on(
     track: Track,
     view: View,
     shares: Shares,
-    wheel: Stand,
-    state: tuple[jax.Array, jax.Array | None, jax.Array],
-) -> tuple[jax.Array, jax.Array | None, jax.Array]:
+    wheel: Placed,
+    state: Carried,
+) -> Carried:
     """Moves the carried sand by one cell, where it stays in the open share of cells and as far as there is room below the
-    rim.
-
-    The state holds heights, what was lost over a draining edge, and what is carried (quanta).
-    """
-    h, gone, carried = state
+    rim."""
+    h, gone, carried = state.height, state.lost, state.carried
     over = block.over(_under(track.way, wheel), view, h + carried)
-    kept, got, around = carried, jnp.zeros_like(h), outer(carried)
+    kept, got, there = carried, jnp.zeros_like(h), outer(carried)
     for (di, dj), part in zip(_FOUR, shares, strict=True):
         here = inner(part)
         kept = kept - truncate(here * carried) * at(view.holds, di, dj)
-        got = got + truncate(seen(part, -di, -dj) * seen(around, -di, -dj))
+        got = got + truncate(seen(part, -di, -dj) * seen(there, -di, -dj))
         if over is not None and gone is not None:
             lost = truncate(here * (over[1] * carried)) * at(over[0], di, dj)
             kept, gone = kept - lost, gone + lost
     got = got * at(view.holds)
     below = jnp.minimum(got, jnp.maximum(wheel.rim - h, 0))
     rest = truncate((1 - wheel.cover) * got + wheel.cover * below)
-    return lax.optimization_barrier((h + rest + kept, gone, got - rest))
+    return lax.optimization_barrier(Carried(h + rest + kept, gone, got - rest))
 
 
 def displaced(
-    block: Block, track: Track, view: View, shares: Shares, wheel: Stand, h: jax.Array, taken: jax.Array
+    block: Block, track: Track, view: View, shares: Shares, wheel: Placed, h: jax.Array, taken: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
     """The heights after the sand `taken` moved on by up to `_PASSES` cells, and what each cell lost over a rim (quanta).
 
@@ -215,16 +223,14 @@ def displaced(
     """
     gone = None if view.beyond is None else jnp.zeros_like(h)
 
-    def once(
-        _: jax.Array, state: tuple[jax.Array, jax.Array | None, jax.Array]
-    ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
+    def once(_: jax.Array, state: Carried) -> Carried:
         return handed_on(block, track, view, shares, wheel, state)
 
-    h, gone, carried = lax.fori_loop(0, _PASSES, once, (h, gone, taken))
-    return h + carried, gone
+    state = lax.fori_loop(0, _PASSES, once, Carried(h, gone, taken))
+    return state.height + state.carried, state.lost
 
 
-def around(block: Block, track: Track, view: View, wheel: Stand, h: jax.Array) -> tuple[Sand, jax.Array]:
+def sand_beside(block: Block, track: Track, view: View, wheel: Placed, h: jax.Array) -> tuple[Sand, jax.Array]:
     """The sand of the block around the wheel, and how much the wheel is in contact with it, 0 to 1."""
     way = track.way
     touch = _touch(track, wheel, h)
@@ -235,18 +241,18 @@ def around(block: Block, track: Track, view: View, wheel: Stand, h: jax.Array) -
     return sand, block.contact(_under(way, wheel), view, wheel.cover, h)
 
 
-def _touch(track: Track, wheel: Stand, h: jax.Array) -> jax.Array:
+def _touch(track: Track, wheel: Placed, h: jax.Array) -> jax.Array:
     """How much sand touches the wheel in each cell: 1 at the rim and above, 0 from `_TOUCH` spacings below it."""
     reach = spread(_TOUCH * track.way.spacing / track.way.quantum, h)
     return jnp.clip(1 + jnp.maximum(h - wheel.rim, -reach) / reach, 0, 1)
 
 
-def _under(way: Way, wheel: Stand) -> Way:
+def _under(way: Way, wheel: Placed) -> Way:
     """The leg of a tool whose bottom is the wheel's rim."""
     return replace(way, bottom=wheel.rim * way.quantum)
 
 
-def _gates(neighbours: Neighbours, wheel: Stand, touch: jax.Array, holds: jax.Array) -> tuple[jax.Array, Fluxes]:
+def _gates(neighbours: Neighbours, wheel: Placed, touch: jax.Array, holds: jax.Array) -> tuple[jax.Array, Fluxes]:
     """The open share of each cell and of each link; `holds` is 1 where a cell can hold sand, with ghost cells.
 
     A link is as open as the narrower of its two cells, times 2 / (1 + narrower / wider). Where one of the wheel's planes

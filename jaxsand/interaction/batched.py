@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.rule import PushRule
-from jaxsand.interaction.simulate import STROKES, Rules, Shaped, Strokes, lifted, ready, step, windows_for
+from jaxsand.interaction.simulate import STROKES, Rules, Shaped, Strokes, checked, lifted, step, windows_for
 from jaxsand.relaxation.batching import in_groups, in_turns, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
@@ -166,7 +166,7 @@ def _batch(
         remedy = f"give [{height.shape[0]}, 4], one stroke for each map, or [{height.shape[0]}, 6] with heights"
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
     check_chunk(chunk)
-    scene, _, rules = ready(scene, height[0], *rules)
+    scene, _, rules = checked(scene, height[0], *rules)
 
     def run(scene: Scene, who: slice | np.ndarray) -> Tree:
         batch = jax.tree.map(lambda x: x[who], (height, stroke, args))

@@ -15,13 +15,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.interaction._displacement import Job, contact, settle_around, take, whole
+from jaxsand.interaction._displacement import Site, contact, settle_around, take, whole
 from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
-from jaxsand.interaction._overflow import Rim, nothing_beyond
+from jaxsand.interaction._overflow import RimAhead, nothing_beyond
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._shade import on_line, within_reach
 from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slices, to_slice, wedge
-from jaxsand.relaxation.ghost_cells import Lost, lose, total
+from jaxsand.relaxation.ghost_cells import ExactSum, lose, total
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
 from jaxsand.scene.scene import Scene, deep
@@ -104,38 +104,45 @@ def push_swath(
     """Lowers the blade at path[0], moves it along the legs of `path` [n, 2] (m) and lifts it; see `along_legs`."""
     scene = replace(scene, window=Whole())
 
-    def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
+    def leg(site: Site, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
         h, lost = state.height, state.lost
         if before is None:
             old = jnp.zeros_like(h)
         else:
-            old = coverage(job.tool, before, job.x, job.y, job.bed.spacing)
-            flow = replace(job.flow, rate=job.flow.rate * contact(job, old, h))
-            h, lost = settle_around(job, flow, push.sweeps, old, h, lost)
-        h, lost = _sweep_out(scene, job, pose, length, old, before is None, h, lost)
+            old = coverage(site.tool, before, site.x, site.y, site.bed.spacing)
+            flow = replace(site.flow, rate=site.flow.rate * contact(site, old, h))
+            h, lost = settle_around(site, flow, push.sweeps, old, h, lost)
+        h, lost = _sweep_out(scene, site, pose, length, old, before is None, h, lost)
         return replace(state, height=h, lost=lost)
 
     return along_legs(scene, height, path, push.rate, leg, record)
 
 
 def _sweep_out(  # noqa: PLR0915
-    scene: Scene, job: Job, pose: Pose, length: jax.Array, old: jax.Array, lowered: bool, h: jax.Array, lost: Lost
-) -> tuple[jax.Array, Lost]:
+    scene: Scene,
+    site: Site,
+    pose: Pose,
+    length: jax.Array,
+    old: jax.Array,
+    lowered: bool,
+    h: jax.Array,
+    lost: ExactSum | None,
+) -> tuple[jax.Array, ExactSum | None]:
     """One leg: takes up the sand in the way and sets it down."""
-    dx, tool = job.bed.spacing, job.tool
+    dx, tool = site.bed.spacing, site.tool
     half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2
-    first_pose, under = pose, coverage(tool, pose, job.x, job.y, dx)
-    _, pose, length = over_the_map(scene, job, pose, length)
-    cover = coverage(tool, pose, job.x, job.y, dx, length)
+    first_pose, under = pose, coverage(tool, pose, site.x, site.y, dx)
+    _, pose, length = over_the_map(scene, site, pose, length)
+    cover = coverage(tool, pose, site.x, site.y, dx, length)
     sand = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
-    h, taken = take(job, h, old, jnp.maximum(cover, old))
+    h, taken = take(site, h, old, jnp.maximum(cover, old))
     taken = jnp.where(sand > 0, taken, 0)  # heights of whole cells throughout
     first = taken * (under / jnp.where(cover > 0, cover, 1)) if lowered else jnp.zeros_like(taken)
-    s, n = local(pose, job.x, job.y)
+    s, n = local(pose, site.x, site.y)
     end, off = half + length, jnp.abs(n) - side
 
     # Slices of the stroke, of a spacing or more each; a cell belongs to two of them.
-    least, _ = corners(scene, job, pose)
+    least, _ = corners(scene, site, pose)
     origin = jnp.maximum(-half, least)
     count = math.ceil(math.hypot(*scene.grid.shape) / 4) + 2
     slices = jnp.arange(count, dtype=h.dtype)
@@ -147,7 +154,7 @@ def _sweep_out(  # noqa: PLR0915
     swept = cover * sand
     area = jnp.sum(swept)
     depth = jnp.maximum(jnp.sum(taken) / jnp.where(area > 0, area, 1), dx / 1000)
-    mu = typical_drop(job, (cover + 1e-6 * under) * sand) / dx
+    mu = typical_drop(site, (cover + 1e-6 * under) * sand) / dx
     if isinstance(scene.walls, Walls):
         widths = in_slices(at, count, swept) * (dx * dx / thick)
     else:
@@ -157,9 +164,9 @@ def _sweep_out(  # noqa: PLR0915
     reach = jnp.sqrt(tool.width * depth / mu)
 
     rim = None
-    if job.bed.rim is not None:
+    if site.bed.rim is not None:
         ground = jnp.sum(swept * jnp.where(sand > 0, h + taken, 0)) / jnp.where(area > 0, area, 1)
-        rim = Rim.of(scene, job, ground, sand, seen)
+        rim = RimAhead.of(scene, site, ground, sand, seen)
 
     # The berms, left and right; where they find room.
     into = 1 - jnp.exp(-_INTO - _DEEP * (reach / (2 * side)) ** 3)
@@ -190,7 +197,7 @@ def _sweep_out(  # noqa: PLR0915
     if lowered:
         there = hat(jnp.clip(-origin / thick, 0, count - 1)[None, None], slices)[:, 0]
         back = _BACK + (0.5 - _BACK) * (1 - jnp.max(open_ @ there))
-        ring, back = _ring(first_pose, job, under, seen, jnp.sum(first), back, mu)
+        ring, back = _ring(first_pose, site, under, seen, jnp.sum(first), back, mu)
     onward = taken - first * back
     ahead = in_slices(at, count, onward)
     ahead = ahead.at[-1].add(jnp.sum(onward * jnp.clip(at - (count - 1), 0, 1)))  # what sticks out of the last slice
@@ -211,25 +218,25 @@ def _sweep_out(  # noqa: PLR0915
     put = of_slices(at, left, density * (dx / thick)) * (outside + inside)
     wanted, there = jnp.sum(density * (room - beyond)), total(put)
     scale = wanted / jnp.where(wanted > 0, jnp.maximum(there, wanted / 2), 1)
-    heap, kept, gone = _heap(job, pose, end, heaped, h, seen, open_ @ there_end, width, mu, rim)
+    heap, kept, gone = _heap(site, pose, end, heaped, h, seen, open_ @ there_end, width, mu, rim)
     put, kept = put * scale + ring + heap, kept + jnp.maximum(wanted - 2 * there, 0)
     last = taken * jnp.exp(jnp.clip((s - end) / (2 * half), -_FAR, 0))
-    put = whole(job, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1)))
+    put = whole(site, put + last * (kept / jnp.where(kept > 0, jnp.sum(last), 1)))
     if lost is not None:
         every = jnp.sum(taken)
         gone = gone + jnp.sum(density * beyond)
-        over = whole(job, taken * (gone / jnp.where(every > 0, every, 1)))
-        lost, taken = lose(job.flow.quantum, lost, over), taken - over
-    return h + complete(job, taken, put), lost
+        over = whole(site, taken * (gone / jnp.where(every > 0, every, 1)))
+        lost, taken = lose(site.flow.quantum, lost, over), taken - over
+    return h + complete(site, taken, put), lost
 
 
 def _ring(
-    pose: Pose, job: Job, under: jax.Array, sand: jax.Array, first: jax.Array, back: jax.Array, mu: jax.Array
+    pose: Pose, site: Site, under: jax.Array, sand: jax.Array, first: jax.Array, back: jax.Array, mu: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """The sand [H, W] that leaves behind and beside a blade as it is lowered, and its share of all that lay there."""
-    dx, tool = job.bed.spacing, job.tool
+    dx, tool = site.bed.spacing, site.tool
     half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2
-    s, n = local(pose, job.x, job.y)
+    s, n = local(pose, site.x, site.y)
     behind = lean(-half - s, jnp.abs(n) - side, dx, sand)
     where = Lean(behind.far, (1 - under) * jnp.clip((half - s) / dx + 0.5, 0, 1) * sand)
     start = unbounded(back * first / mu, jnp.asarray(tool.width), jnp.ones_like(mu), dx)
@@ -242,7 +249,7 @@ def _ring(
 
 
 def _heap(
-    job: Job,
+    site: Site,
     pose: Pose,
     end: jax.Array,
     volume: jax.Array,
@@ -251,11 +258,11 @@ def _heap(
     open_: jax.Array,
     width: jax.Array,
     mu: jax.Array,
-    rim: Rim | None,
+    rim: RimAhead | None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The heap ahead of the blade [H, W], the part of `volume` that finds no room there, and the part that runs off."""
-    dx, side = job.bed.spacing, jnp.asarray(job.tool.width) / 2
-    s, n = local(pose, job.x, job.y)
+    dx, side = site.bed.spacing, jnp.asarray(site.tool.width) / 2
+    s, n = local(pose, site.x, site.y)
     where = lean(s - end - _AHEAD * dx * jnp.maximum(open_[0], open_[1]), jnp.abs(n) - side, dx, sand)
     falls = open_[0] * jnp.clip(n, 0, side) + open_[1] * jnp.clip(-n, 0, side)
     where = Lean(where.far + _FALL * falls, where.share)
@@ -273,31 +280,31 @@ def _heap(
     total = jnp.sum(heap)
     heap = heap * ((placed - gone) / jnp.where(total > 0, total, 1))
     if rim is not None:
-        stays = jnp.minimum(heap, rim.room(job, h, mu))
+        stays = jnp.minimum(heap, rim.room(site, h, mu))
         heap, gone = stays, gone + jnp.sum(heap - stays)
     return heap, volume - placed, gone
 
 
-def typical_drop(job: Job, weight: Float[Array, "H W"]) -> Float[Array, ""]:
+def typical_drop(site: Site, weight: Float[Array, "H W"]) -> Float[Array, ""]:
     """The largest stable step between neighbours (m): the bed's, or its weighted mean where it differs from cell to cell."""
-    drop = job.bed.drop
+    drop = site.bed.drop
     if not drop.ndim:
         return drop
     total = jnp.sum(weight)
     return jnp.where(total > 0, jnp.sum(weight * drop) / jnp.where(total > 0, total, 1), jnp.max(drop))
 
 
-def complete(job: Job, taken: Float[Array, "H W"], put: Float[Array, "H W"]) -> Float[Array, "H W"]:
+def complete(site: Site, taken: Float[Array, "H W"], put: Float[Array, "H W"]) -> Float[Array, "H W"]:
     """`put` with the rounding error of its sum added to its highest cell, so that it adds up to `taken` exactly."""
     # The counts fit their integers or wrap around; their sum is right, since what is left over is small.
-    quanta = jnp.round(lax.stop_gradient(taken - put) / job.flow.quantum)
+    quanta = jnp.round(lax.stop_gradient(taken - put) / site.flow.quantum)
     rest = jnp.sum(quanta.astype(jnp.int64 if put.dtype == jnp.float64 else jnp.int32)).astype(put.dtype)
     # Its column, then its row: XLA vectorises the largest of each column, but not an argmax over the map.
     shown = lax.stop_gradient(put)
     column = jnp.argmax(jnp.max(shown, axis=0))
     row = jnp.argmax(shown[:, column])
     here = (jnp.arange(put.shape[0])[:, None] == row) & (jnp.arange(put.shape[1])[None, :] == column)
-    return put + jnp.where(here, rest * job.flow.quantum, 0)
+    return put + jnp.where(here, rest * site.flow.quantum, 0)
 
 
 def _heap_balance(gains: jax.Array, shares: jax.Array) -> tuple[jax.Array, jax.Array]:

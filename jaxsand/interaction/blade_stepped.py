@@ -28,12 +28,13 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._advance import Advance, Rest
 from jaxsand.interaction._block import SPARE, Block, Way
-from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._leg import Steps, chunk, moved, way_of
+from jaxsand.interaction._displacement import Site
+from jaxsand.interaction._leg import LegSteps, chunk, moved, way_of
 from jaxsand.interaction._lowering import Lower
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, heading, travelled, upright
-from jaxsand.interaction._turning import Turn
+from jaxsand.interaction._turning import BladeTurn
 from jaxsand.interaction.resting import bring_to_rest
+from jaxsand.relaxation.ghost_cells import ExactSum
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, Number, Pose
 from jaxsand.scene.validation import concrete
@@ -69,14 +70,14 @@ def scoop_along(
     push: "SteppedPush",
     room: Float[Array, ""],
     record: Record | None = None,
-) -> tuple[Pushed, Tree, tuple[jax.Array, jax.Array]]:
+) -> tuple[Pushed, Tree, ExactSum]:
     """Moves a bucket's edge along `path` (m); what it cuts goes into the bucket, up to a sum of heights of `room` (m).
 
     The scene's tool is a blade as wide as the edge, a cell thick at most. It is moved such that its rear starts at path[0]
     and its front ends at path[-1], so that what it cuts lies between the path's ends. First and last legs shorter than half
     a cell are cut a little beyond their ends. Every leg keeps some of its length, and thereby its heading.
 
-    Returns the map, what `record` returned after each leg, and the account (low, high) of the sum of heights (m) in the
+    Returns the map, what `record` returned after each leg, and the account of the sum of heights (m) in the
     bucket.
     """
     runs = path[1:] - path[:-1]
@@ -100,30 +101,30 @@ def _leg(
     push: "SteppedPush",
     rest: Rest,
     keeps: bool,
-    job: Job,
+    site: Site,
     pose: Pose,
     length: jax.Array,
     before: Pose | None,
     state: State,
 ) -> State:
     """Lowers the blade, or turns it from the pose before, and moves it ahead by `length` (m); see `moved`."""
-    shape, dx, substep = scene.grid.shape, job.bed.spacing, push.substep
+    shape, dx, substep = scene.grid.shape, site.bed.spacing, push.substep
     size = near = max(shape)
     if isinstance(scene.window, Window) and max(scene.window.size) < size:
         size = max(scene.window.size)
         near = min(size, scene.window.near or size)
-    block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, job.bed.rim is not None)
+    block = Block(shape, size, near, size < max(shape), scene.grid.neighbours, site.bed.rim is not None)
     if near < size:  # a traced blade may be larger than the one for which the window was made
-        far = lax.stop_gradient(_far(*(size / dx for size in _body(job.tool, dx))))
+        far = lax.stop_gradient(_far(*(size / dx for size in _body(site.tool, dx))))
         state = replace(state, moved=jnp.where(2 * jnp.floor(far) + 3 > near, jnp.inf, state.moved))
 
-    def way(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
-        half, side = (jnp.asarray(extent) / dx / 2 for extent in (job.tool.thickness, job.tool.width))
-        return way_of(job, pose, length, angle, half, side)
+    def way(site: Site, pose: Pose, length: jax.Array, angle: jax.Array) -> Way:
+        half, side = (jnp.asarray(extent) / dx / 2 for extent in (site.tool.thickness, site.tool.width))
+        return way_of(site, pose, length, angle, half, side)
 
-    steps = Steps(
+    steps = LegSteps(
         Lower(block),
-        Turn(block, substep=substep, sweeps=push.sweeps, rest=rest, keeps=keeps),
+        BladeTurn(block, substep=substep, sweeps=push.sweeps, rest=rest, keeps=keeps),
         Advance(
             block,
             substep=substep,
@@ -135,7 +136,7 @@ def _leg(
         ),
         2 * math.hypot(*shape) + 3,  # make_scene holds the thickness below the map's diagonal
     )
-    return moved(scene, job, steps, way, pose, length, before, state)
+    return moved(scene, site, steps, way, pose, length, before, state)
 
 
 def with_near(scene: Scene) -> Scene:

@@ -18,8 +18,9 @@ from jaxsand.interaction._path import Record, farthest, heading
 from jaxsand.interaction.blade_stepped import scoop_along
 from jaxsand.interaction.load import Load, added, as_load, inside_of, one_load, spilled
 from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured
-from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, as_path, itself, lifted, ready
+from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, as_path, checked, itself, lifted
 from jaxsand.interaction.stepped import SteppedPush
+from jaxsand.relaxation.ghost_cells import ExactSum
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
@@ -128,7 +129,7 @@ def _scoop(
     if push is not None and not isinstance(push, SteppedPush):
         raise ValueError(f"push: got {push!r}; a bucket scoops by SteppedPush(substep, sweeps)")
     edge = replace(scene, tool=Blade(bucket.width, scene.grid.spacing, bucket.depth))
-    edge, height, rules = ready(edge, height, push, scheme, stop)
+    edge, height, rules = checked(edge, height, push, scheme, stop)
     path = as_path(path, height.dtype)
     if path.shape[1] == 2:
         path = jnp.concatenate([path, jnp.full_like(path[:, :1], -jnp.asarray(bucket.depth, path.dtype))], 1)
@@ -274,7 +275,7 @@ def _dumped(
     if path.shape[0] > 1:  # where the path has no length, it is a point
         spread = path_weights(scene, path, jnp.where(sound, width, 0))
         weights = jnp.where(jnp.any(path[1:] != path[:-1]), spread, weights)
-    after, account, missed = poured(scene, height, weights, asked, (held.low, held.high))
+    after, account, missed = poured(scene, height, weights, asked, ExactSum(held.low, held.high))
     settled = relax(scene, after, *rules)
     outcome = settled.outcome | missed | said(Outcome.NOT_FINITE, ~sound)
     way, _ = heading(path[-2 if path.shape[0] > 1 else 0], path[-1], None)

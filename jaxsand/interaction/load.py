@@ -15,6 +15,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction.pouring import point_weights, poured
+from jaxsand.relaxation.ghost_cells import ExactSum
 from jaxsand.relaxation.schemes import SuperTimeStepping
 from jaxsand.relaxation.settling import run_off
 from jaxsand.relaxation.stopping import UntilStill
@@ -108,13 +109,13 @@ def one_load(load: Load | None, dtype: DTypeLike, inside: Scene | None) -> Load:
     return Heaped(held.high, held.low, surface)
 
 
-def added(load: Load, account: tuple[jax.Array, jax.Array], sign: float) -> Load:
-    """The load with an account (low, high) added or taken away, without rounding beyond that of the second float.
+def added(load: Load, account: ExactSum, sign: float) -> Load:
+    """The load with an account added or taken away, without rounding beyond that of the second float.
 
     A map that tells how it lies is raised or lowered in proportion, or, where there was nothing, evenly.
     """
-    high, rest = _two_sum(load.high, sign * account[1])
-    high, low = _two_sum(high, load.low + sign * account[0] + rest)
+    high, rest = _two_sum(load.high, sign * account.high)
+    high, low = _two_sum(high, load.low + sign * account.low + rest)
     if not isinstance(load, Heaped):
         return Load(high, low)
     return Heaped(high, low, _holding(load.surface, high + low))
@@ -175,5 +176,5 @@ def spilled(scene: Scene, inside: Scene, pose: Pose, height: jax.Array, load: Lo
     amounts = jnp.concatenate(amount)
     weights = jnp.tensordot(amounts, jax.vmap(lambda point: point_weights(scene, point))(points), 1)
     whole = jnp.sum(amounts)
-    after, account, missed = poured(scene, height, weights, whole, (jnp.zeros_like(whole), whole))
+    after, account, missed = poured(scene, height, weights, whole, ExactSum(jnp.zeros_like(whole), whole))
     return after, added(replace(load, surface=surface), account, -1), missed

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import heading
-from jaxsand.relaxation.ghost_cells import Bed, counted, largest, mark, prepare, quantum, total, truncate, unmark
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, counted, largest, mark, prepare, quantum, total, truncate, unmark
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
@@ -21,7 +21,6 @@ from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import interval, local
 from jaxsand.scene.validation import concrete, short
 
-Account = tuple[jax.Array, jax.Array]
 _ROUNDS = 32  # in each of which the cells that are emptied are found; on the usual footprints two or three suffice
 
 
@@ -153,7 +152,7 @@ def _settled(
     bed, there = prepare(scene), amount
     if bed.base is not None and sign < 0:
         where, there = _on_floor(bed, mark(scene, height)[0], where, amount)
-    changed, _, missed = poured(scene, height, where, amount, (jnp.zeros_like(amount), there), sign)
+    changed, _, missed = poured(scene, height, where, amount, ExactSum(jnp.zeros_like(amount), there), sign)
     settled = relax(scene, changed, *rules)
     return replace(settled, outcome=settled.outcome | missed)
 
@@ -184,18 +183,18 @@ def _on_floor(bed: Bed, height: jax.Array, weights: jax.Array, amount: jax.Array
 
 
 def poured(
-    scene: Scene, height: jax.Array, weights: jax.Array, amount: jax.Array, held: Account, sign: jax.Array | float = 1.0
-) -> tuple[jax.Array, Account, jax.Array]:
+    scene: Scene, height: jax.Array, weights: jax.Array, amount: jax.Array, held: ExactSum, sign: jax.Array | float = 1.0
+) -> tuple[jax.Array, ExactSum, jax.Array]:
     """The map after a sum of heights `amount` (m) was put down (or, of sign -1, taken away) in proportion to weights [H, W].
 
-    All of `held` (low, high), and no more, is put down if `amount` is as much or more.
+    All of `held`, and no more, is put down if `amount` is as much or more.
 
     Returns the map, the sum of heights that was put down as an account (m), and NOT_POURED if it was less than `amount`, or
     NOT_FINITE, and the map as it was, if a number is not finite or below 0.
     """
     bed = prepare(scene)
     marked, _ = mark(scene, height)
-    there = held[0] + held[1]
+    there = held.value
     sound = jnp.isfinite(there) & (there >= 0) & jnp.isfinite(amount) & (amount >= 0) & jnp.all(jnp.isfinite(weights))
     weights = jnp.where(sound & ~jnp.isnan(marked), jnp.maximum(weights, 0), 0)
     most = jnp.max(weights)
@@ -207,13 +206,12 @@ def poured(
     size = quantum(jnp.maximum(largest(marked), bed.elsewhere) + jnp.max(share) * given)
     put = truncate(share * given / size)
     zero = jnp.zeros_like(given)
-    account = counted((zero, zero), put)
+    account = counted(ExactSum(zero, zero), put)
 
     def rest() -> jax.Array:
         """What is yet to be put down, in whole quanta; of all that is held to the last one."""
-        low, high = account
-        of_all = (held[1] / size - high) + (held[0] / size - low)
-        left = jnp.where(asked >= there, of_all, given / size - (low + high))
+        of_all = (held.high / size - account.high) + (held.low / size - account.low)
+        left = jnp.where(asked >= there, of_all, given / size - account.value)
         return jnp.where(whole > 0, jnp.floor(lax.stop_gradient(left)), 0)
 
     # Rounding leaves some: first in proportion to the weights, then a quantum to a cell, then, if need be, to one cell.
@@ -225,10 +223,9 @@ def poured(
     put, account = put + more, counted(account, more)
     last = rest()
     put = put.ravel().at[jnp.argmax(share.ravel())].add(last).reshape(put.shape)
-    low, high = account
     missed = said(Outcome.NOT_POURED, (asked > there * (1 + 1e-6)) | ((whole <= 0) & (asked > 0)))
     missed = missed | said(Outcome.NOT_FINITE, ~sound)
-    return unmark(marked + sign * (put * size), height), ((low + last) * size, high * size), missed
+    return unmark(marked + sign * (put * size), height), ExactSum((account.low + last) * size, account.high * size), missed
 
 
 def point_weights(scene: Scene, point: Float[Array, "2"]) -> Float[Array, "H W"]:

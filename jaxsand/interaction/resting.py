@@ -62,8 +62,8 @@ def no_flux(neighbours: Neighbours, drains: bool, h: Map) -> Fluxes:
     if neighbours == "isotropic":
         maps = [jnp.zeros_like(h)] * 8
     else:
-        around = jnp.zeros((h.shape[0] + 2, h.shape[1] + 2, *h.shape[2:]), h.dtype)
-        maps = [ends(around, di, dj)[0] for di, dj, _ in links(neighbours)]
+        with_ghosts = jnp.zeros((h.shape[0] + 2, h.shape[1] + 2, *h.shape[2:]), h.dtype)
+        maps = [ends(with_ghosts, di, dj)[0] for di, dj, _ in links(neighbours)]
     return (*maps, jnp.zeros_like(h)) if drains else tuple(maps)
 
 
@@ -105,19 +105,19 @@ class Links:
         """The flux that the largest stable step would drive, the same in all directions."""
         return self.rate * self.sand.drop
 
-    def shrink(self, flux: Fluxes, around: jax.Array) -> Fluxes:
-        """The fluxes after one proximal step; `around` is the surface with ghost cells."""
+    def shrink(self, flux: Fluxes, surface: jax.Array) -> Fluxes:
+        """The fluxes after one proximal step; `surface` is that of the sand, with ghost cells."""
         out, neighbours = [], self.sand.neighbours
         thresholds = [self.most] * len(self.sand.gates)
-        if self.sand.drop.ndim == around.ndim:
+        if self.sand.drop.ndim == surface.ndim:
             thresholds = [(here + there) / 2 for here, there in both_ends(neighbours, outer(self.most))]
-        parts = zip(flux, self.sand.gates, self.factors, rises(neighbours, around), thresholds, strict=False)
+        parts = zip(flux, self.sand.gates, self.factors, rises(neighbours, surface), thresholds, strict=False)
         for f, g, factor, rise, threshold in parts:
             z, most = f + g * (factor * rise), g * threshold
             # Comparisons become single instructions; minimum and maximum, which look for NaN, do not.
             out.append(nearest(z - jnp.where(z > most, most, jnp.where(z < -most, -most, z))))
         if self.sand.sides is not None:
-            out.append(_over(self.sand, self.rate, flux[-1], inner(around)))
+            out.append(_over(self.sand, self.rate, flux[-1], inner(surface)))
         return tuple(out) if self.there is None else no_more_than(neighbours, self.there, out)
 
     def gained(self, flux: Fluxes) -> jax.Array:
@@ -137,11 +137,11 @@ class _Gradients:
     rate: jax.Array
     there: Map | None = None
 
-    def shrink(self, y: Fluxes, around: jax.Array) -> Fluxes:
-        """The fluxes after one proximal step; `around` is the surface with ghost cells."""
-        arms = [d * _felt(gate) for d, gate in zip(rises("isotropic", around), self.sand.gates, strict=True)]
+    def shrink(self, y: Fluxes, surface: jax.Array) -> Fluxes:
+        """The fluxes after one proximal step; `surface` is that of the sand, with ghost cells."""
+        arms = [d * _felt(gate) for d, gate in zip(rises("isotropic", surface), self.sand.gates, strict=True)]
         if self.there is not None:
-            wet = outer(jnp.where(self.there > jnp.maximum(THIN * self.sand.drop, 8), 1.0, 0.0).astype(around.dtype))
+            wet = outer(jnp.where(self.there > jnp.maximum(THIN * self.sand.drop, 8), 1.0, 0.0).astype(surface.dtype))
             both = both_ends("isotropic", wet)
             arms = [d * jnp.where(d > 0, there, here) for d, (here, there) in zip(arms, both, strict=True)]
         across, up = _both_ends(arms)
@@ -154,7 +154,7 @@ class _Gradients:
             part = share_beyond(zx * zx + zy * zy, rate * self.sand.drop)
             out += [zx * part, zy * part]
         if self.sand.sides is not None:
-            over = _over(self.sand, self.rate, y[-1], inner(around))
+            over = _over(self.sand, self.rate, y[-1], inner(surface))
             out.append(over if self.there is None else jnp.minimum(over, self.there))
         return tuple(out)
 

@@ -87,7 +87,7 @@ def act(scene: Scene, height: Float[ArrayLike, "H W"], stroke: Stroke, *, push: 
         >>> bool(pushed.height[4, 4] < 0), bool(pushed.height[4, 7] > 0)  # a trench, and a heap ahead of it
         (True, True)
     """
-    scene, height, rules = ready(scene, height, push, None, None)
+    scene, height, rules = checked(scene, height, push, None, None)
     path = _stroke(stroke, height.dtype)
     return as_needed(lambda scene, _: _act(scene, height, path, rules), scene, rules, (height, path))
 
@@ -189,7 +189,7 @@ def follow(
         >>> print(f"{shaped.pose.x:.2f} {shaped.pose.y:.2f} {shaped.pose.sin:.2f}")
         0.06 0.06 1.00
     """
-    scene, height, rules = ready(scene, height, push, scheme, stop)
+    scene, height, rules = checked(scene, height, push, scheme, stop)
     path = as_path(path, height.dtype)
     return as_needed(partial(_followed, height, path, rules), scene, rules, (height, path))
 
@@ -229,7 +229,7 @@ def follow_frames(
         >>> frames.shape
         (1, 8, 8)
     """
-    scene, height, rules = ready(scene, height, push, scheme, stop)
+    scene, height, rules = checked(scene, height, push, scheme, stop)
     path = as_path(path, height.dtype)
     return as_needed(lambda scene, _: _follow(scene, height, path, rules, record=itself), scene, rules, (height, path))
 
@@ -271,7 +271,7 @@ def rollout(
         >>> js.rollout(scene, jnp.zeros((8, 8)), strokes).height.shape
         (2, 8, 8)
     """
-    scene, height, rules = ready(scene, height, push, scheme, stop)
+    scene, height, rules = checked(scene, height, push, scheme, stop)
     strokes = as_array("strokes", strokes, height.dtype, POINTS)
     if strokes.ndim != 2 or strokes.shape[1] not in STROKES:
         remedy = "give a row x0, y0, x1, y1 [n, 4] or x0, y0, z0, x1, y1, z1 [n, 6] for each push"
@@ -291,14 +291,14 @@ def as_needed(
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, rules, arrays))):
         return run(next(windows_for(scene, rules[0], _SURE), scene), Whole())
     for part in windows_for(scene, rules[0]):
-        out = run(part, _around(part, arrays[1], rules[1]))
+        out = run(part, _settling_window(part, arrays[1], rules[1]))
         outcome = (out[0] if isinstance(out, tuple) else out).outcome
         if not np.any(np.asarray(outcome) & Outcome.WINDOW_EDGE):
             return out
     return run(scene, Whole())
 
 
-def _around(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
+def _settling_window(scene: Scene, path: jax.Array, scheme: Scheme) -> Whole | Window:
     """A settling window that holds the path and the blade's window at its ends.
 
     Whole() unless the map is much wider, and for schemes whose result depends on where the map begins.
@@ -324,7 +324,7 @@ def check_push(push: object) -> None:
         raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
 
 
-def ready(
+def checked(
     scene: Scene, height: Float[ArrayLike, "H W"], push: PushRule | None, scheme: Scheme | None, stop: Stop | None
 ) -> tuple[Scene, Float[Array, "H W"], Rules]:
     """The checked arguments, with None replaced by defaults and every number cast to the height's dtype."""

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.interaction._displacement import Job, whole
+from jaxsand.interaction._displacement import Site, whole
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._slices import hat, wedge
 from jaxsand.interaction.blade_closed_form import ROOM, complete, typical_drop
@@ -80,27 +80,27 @@ def push_split(
     """Moves the wheel along the legs of `path` [n, 2] (m); see `along_legs`."""
     scene = replace(scene, window=Whole())
 
-    def leg(job: Job, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
-        return replace(state, height=_pass(scene, job, pose, length, state.height))
+    def leg(site: Site, pose: Pose, length: jax.Array, before: Pose | None, state: State) -> State:
+        return replace(state, height=_pass(scene, site, pose, length, state.height))
 
     return along_legs(scene, height, path, 0.125, leg, record)
 
 
-def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -> jax.Array:
+def _pass(scene: Scene, site: Site, pose: Pose, length: jax.Array, h: jax.Array) -> jax.Array:
     """One leg: takes up the sand of the cut and sets it down in piles beside it, slice by slice along the leg."""
-    dx, wheel = job.bed.spacing, job.tool
-    _, pose, length = over_the_map(scene, job, pose, length)
+    dx, wheel = site.bed.spacing, site.tool
+    _, pose, length = over_the_map(scene, site, pose, length)
     side = jnp.where(wheel.slip_angle < 0, -1, 1)
-    s, n = local(pose, job.x, job.y)
+    s, n = local(pose, site.x, site.y)
     n = n * side  # the flank leads on the positive side
     rim, flank, share, floor = _shares(wheel)
-    taken = whole(job, _cut(job, s, n, length, floor, h))
+    taken = whole(site, _cut(site, s, n, length, floor, h))
     sand = jnp.where(jnp.isnan(h), 0.0, 1.0).astype(h.dtype)
-    mu = typical_drop(job, (taken + 1e-6) * sand) / dx
+    mu = typical_drop(site, (taken + 1e-6) * sand) / dx
 
     # Slices along the way, of a spacing or more each; a cell belongs to two of them, or to one at the map's edge, where
     # slices are as long as others.
-    least, most = corners(scene, job, pose)
+    least, most = corners(scene, site, pose)
     far = reach(wheel) + dx
     first, last = jnp.maximum(-far, least), jnp.minimum(length + far, most)
     count = math.ceil(math.hypot(*scene.grid.shape) / 4) + 2
@@ -118,8 +118,8 @@ def _pass(scene: Scene, job: Job, pose: Pose, length: jax.Array, h: jax.Array) -
         kept = kept - placed
         put = put + pile * (placed / jnp.where(room > 0, room, 1) * (dx / thick) @ hats).reshape(h.shape)
     stays = (kept / jnp.where(cut > 0, cut, 1)) @ hats
-    put = whole(job, put + taken * stays.reshape(h.shape))
-    return h - taken + complete(job, taken, put)
+    put = whole(site, put + taken * stays.reshape(h.shape))
+    return h - taken + complete(site, taken, put)
 
 
 def _shares(wheel: Wheel) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
@@ -153,14 +153,14 @@ def _floor(sinkage: jax.Array, middle: jax.Array, flanks: jax.Array, behind: jax
     return sinkage * (1 - jnp.where(behind > 0, x, 0) ** 2)
 
 
-def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Array, h: jax.Array) -> jax.Array:
+def _cut(site: Site, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Array, h: jax.Array) -> jax.Array:
     """The height of sand that the wheel cuts from each cell [H, W] (m): what lies above its lowest pass and the floor."""
-    wheel = job.tool
+    wheel = site.tool
     slip, half, chord = jnp.abs(wheel.slip_angle), jnp.asarray(wheel.width) / 2, half_chord(wheel.radius, wheel.sinkage)
     cos, sin = jnp.cos(slip), jnp.sin(slip)
     least = float(jnp.finfo(h.dtype).eps)
     least_cos, least_sin = jnp.maximum(cos, least), jnp.maximum(sin, least)
-    slack = job.bed.spacing / (2 * _SAMPLES) * jnp.maximum(1 - 10 * sin, 0) / least_sin  # for samples at an upright flank
+    slack = site.bed.spacing / (2 * _SAMPLES) * jnp.maximum(1 - 10 * sin, 0) / least_sin  # for samples at an upright flank
 
     def sample(k: jax.Array, total: jax.Array) -> jax.Array:
         """Adds what is cut at one point of each cell.
@@ -169,13 +169,13 @@ def _cut(job: Job, s: jax.Array, n: jax.Array, length: jax.Array, floor: jax.Arr
         s - length <= u <= s.
         """
         offset = (jnp.stack([k // _SAMPLES, k % _SAMPLES]) + 0.5) / _SAMPLES - 0.5
-        at, off = s + offset[0] * job.bed.spacing, n + offset[1] * job.bed.spacing
+        at, off = s + offset[0] * site.bed.spacing, n + offset[1] * site.bed.spacing
         near, far = (-half - off * cos) / least_sin, (half - off * cos) / least_sin
         first, last = jnp.maximum(at - length, near - slack), jnp.minimum(at, far + slack)
         a = jnp.clip(off * sin / least_cos, first, last) * cos - off * sin
         inside = jnp.minimum(at - near, far - (at - length)) * least_sin  # how far, across the wheel; a sample has a width
-        share = jnp.clip(0.5 + inside * (_SAMPLES / job.bed.spacing), 0, 1)
-        bottom = jnp.maximum(job.bottom * (1 - (a / chord) ** 2), floor)
+        share = jnp.clip(0.5 + inside * (_SAMPLES / site.bed.spacing), 0, 1)
+        bottom = jnp.maximum(site.bottom * (1 - (a / chord) ** 2), floor)
         return total + share * jnp.where((jnp.abs(a) < chord) & (h > bottom), h - bottom, 0)
 
     return lax.fori_loop(0, _SAMPLES**2, sample, jnp.zeros_like(h)) / _SAMPLES**2

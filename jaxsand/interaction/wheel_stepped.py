@@ -25,10 +25,10 @@ from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._block import Block
-from jaxsand.interaction._displacement import Job
-from jaxsand.interaction._leg import Params, Steps, chunk, moved, way_of
+from jaxsand.interaction._displacement import Site
+from jaxsand.interaction._leg import LegSteps, Params, chunk, moved, way_of
 from jaxsand.interaction._path import Pushed, Record, State, along_legs
-from jaxsand.interaction._rolling import Roll, Touchdown, Turn
+from jaxsand.interaction._rolling import Roll, Touchdown, WheelTurn
 from jaxsand.interaction._wheel import Track
 from jaxsand.interaction.ground import Ground, ground_of
 from jaxsand.relaxation.stopping import Outcome
@@ -65,7 +65,7 @@ def _leg(
     push: "SteppedPush",
     keeps: bool,
     track: Params,
-    job: Job,
+    site: Site,
     pose: Pose,
     length: jax.Array,
     before: Pose | None,
@@ -76,27 +76,27 @@ def _leg(
     size = max(shape)
     if isinstance(scene.window, Window):
         size = min(size, max(scene.window.size))
-    block = Block(shape, size, size, size < max(shape), scene.grid.neighbours, job.bed.rim is not None)
-    steps = Steps(
+    block = Block(shape, size, size, size < max(shape), scene.grid.neighbours, site.bed.rim is not None)
+    steps = LegSteps(
         Touchdown(block),
-        Turn(block, substep=substep, sweeps=sweeps, keeps=keeps),
+        WheelTurn(block, substep=substep, sweeps=sweeps, keeps=keeps),
         Roll(block, substep=substep, sweeps=sweeps, chunk=chunk(substep), lowered=before is None, keeps=keeps),
         4 * math.hypot(*shape) + 3,  # make_scene holds radius and width below the map's diagonal
     )
-    return moved(scene, job, steps, track, pose, length, before, state)
+    return moved(scene, site, steps, track, pose, length, before, state)
 
 
-def _track(job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
+def _track(site: Site, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
     """A leg of the wheel in spacings; `angle` is the turn in place before it (rad)."""
-    dx, wheel = job.bed.spacing, job.tool
-    deep = wheel.sinkage if job.rise is None else -jnp.minimum(job.bottom, job.bottom + length * job.rise)  # where deepest
-    way = way_of(job, pose, length, angle, half_chord(wheel.radius, deep) / dx, jnp.asarray(wheel.width) / dx / 2)
+    dx, wheel = site.bed.spacing, site.tool
+    deepest = wheel.sinkage if site.rise is None else -jnp.minimum(site.bottom, site.bottom + length * site.rise)
+    way = way_of(site, pose, length, angle, half_chord(wheel.radius, deepest) / dx, jnp.asarray(wheel.width) / dx / 2)
     carried = None if isinstance(wheel.grousers, Smooth) else carried_area(wheel, wheel.grousers) / dx
     return Track(way, jnp.asarray(wheel.radius) / dx, jnp.asarray(wheel.slip_angle), carried)
 
 
-def _track_over(ground: Ground, job: Job, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
+def _track_over(ground: Ground, site: Site, pose: Pose, length: jax.Array, angle: jax.Array) -> Track:
     """A leg of a wheel that follows the ground at its sinkage."""
-    level, relief = ground.ahead(job.tool, pose, length)
-    track = _track(replace(job, bottom=job.bottom + level), pose, length, angle)
+    level, relief = ground.ahead(site.tool, pose, length)
+    track = _track(replace(site, bottom=site.bottom + level), pose, length, angle)
     return replace(track, way=replace(track.way, relief=relief))

@@ -1,7 +1,7 @@
 """Multigrid settling; see `Multilevel`.
 
 On every grid a map holds volume per cell area, in whole quanta, so that volume is exact. Where the number of rows or columns
-is odd, the last coarse cells contain sand in a part of their area only (`Partial`).
+is odd, the last coarse cells contain sand in a part of their area only (`PartialCells`).
 """
 
 from dataclasses import replace
@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxsand.relaxation._integrate import Sand, march, still
-from jaxsand.relaxation.flux import Nothing, Partial
+from jaxsand.relaxation._integrate import still, sweep_loop
+from jaxsand.relaxation.flux import Cells, PartialCells, WholeCells
 from jaxsand.relaxation.ghost_cells import Bed, at, grain, halo, nothing_lost, rim_of, truncate
 from jaxsand.relaxation.schemes import Multilevel, schedule
-
-Cells = Nothing | Partial
+from jaxsand.relaxation.sweep import Limits, Swept
 
 
 def descend(
@@ -27,37 +26,36 @@ def descend(
     tolerance: jax.Array,
     bound: int,
     interval: int,
-    sand: Sand,
+    sand: Swept,
     level: int = 0,
-) -> tuple[Sand, jax.Array]:
+) -> tuple[Swept, jax.Array]:
     """Settles on this grid and the coarser ones.
 
     Returns the sand, and the number of sweeps, where four of the next coarser grid count as one of this.
     """
-    rows, columns = (n - 2 for n in sand[0].shape)
+    rows, columns = (n - 2 for n in sand.height.shape)
     early = schedule(scheme.steps(), limit, bound, interval, scheme.handover / 4 if level else 0.0)
     narrow = max(rows, columns) if 1 in (rows, columns) else min(rows, columns)
     if narrow < 2 * scheme.coarsest:
-        return march(bed, cells, early, tolerance, interval).run(bound // interval, sand)
+        return sweep_loop(bed, cells, early, tolerance, interval).run(bound // interval, sand)
     # Up to the first group past the handover that ends with the end of a step.
     ends = early.starts[(early.times >= scheme.handover) & (early.starts % interval == 0)]
     groups = int(ends[0]) // interval if ends.size else bound // interval
-    sand, taken = march(bed, cells, early, tolerance, interval).run(groups, sand)
+    sand, taken = sweep_loop(bed, cells, early, tolerance, interval).run(groups, sand)
 
-    cut = grain(bed, sand[0])
-    wide_bed, wide_cells, wide = _widen(bed, cells, cut, at(sand[0]))
-    begun = (halo(wide), nothing_lost(wide_bed, wide))
+    cut = grain(bed, sand.height)
+    wide_bed, wide_cells, wide = _widen(bed, cells, cut, at(sand.height))
+    begun = Swept(halo(wide), nothing_lost(wide_bed, wide))
     # To half the tolerance, or rounding on the finer grid would set the sand in motion everywhere.
     stiller = tolerance if level else tolerance / 2
-    (ended, lost), more = descend(wide_bed, wide_cells, scheme, limit, stiller, bound, interval, begun, level + 1)
-    early_end = still(bed, cells, (tolerance, 2 / (scheme.safety * limit * bed.spacing)), sand[0])
-    change = jnp.where(jnp.isnan(wide) | early_end, 0, at(ended) - wide)
-    u, gone = sand
-    u = halo(at(u) + _spread(cells, cut, change, at(u)))
-    if gone is not None and lost is not None:
-        gone = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), gone, lost)
+    ended, more = descend(wide_bed, wide_cells, scheme, limit, stiller, bound, interval, begun, level + 1)
+    early_end = still(bed, cells, Limits(tolerance, 2 / (scheme.safety * limit * bed.spacing)), sand.height)
+    change = jnp.where(jnp.isnan(wide) | early_end, 0, at(ended.height) - wide)
+    height, lost = halo(at(sand.height) + _spread(cells, cut, change, at(sand.height))), sand.lost
+    if lost is not None and ended.lost is not None:
+        lost = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), lost, ended.lost)
     late = schedule(scheme.steps(), limit, bound, interval)
-    sand, again = march(bed, cells, late, tolerance, interval).run(bound // interval, (u, gone))
+    sand, again = sweep_loop(bed, cells, late, tolerance, interval).run(bound // interval, Swept(height, lost))
     return sand, taken + again + jnp.where(early_end, 0, (more + 3) // 4)
 
 
@@ -65,8 +63,8 @@ def _widen(bed: Bed, cells: Cells, cut: jax.Array, volume: jax.Array) -> tuple[B
     """The bed, the cells and the volume [H/2, W/2] of the next coarser grid."""
     wide = _sum(_quarters(volume)) / 4  # NaN where any of the four is: no sand passes through a wall
     wide_cells: Cells = cells
-    if isinstance(cells, Partial):
-        wide_cells = Partial(halo(_sum(_quarters(at(cells.open))) / 4, 0.0))
+    if isinstance(cells, PartialCells):
+        wide_cells = PartialCells(halo(_sum(_quarters(at(cells.open))) / 4, 0.0))
     wide = truncate(wide / cut) * cut
     drop = bed.drop * 2
     if bed.drop.ndim:
@@ -98,7 +96,7 @@ def _spread(cells: Cells, cut: jax.Array, change: jax.Array, volume: jax.Array) 
     """
     rows, columns = volume.shape
     whole_cell = ~jnp.isnan(volume)
-    if isinstance(cells, Nothing):
+    if isinstance(cells, WholeCells):
         fine = _inject(change, volume.shape)
     else:
         parts = _quarters(at(cells.open))
@@ -126,10 +124,10 @@ def _spread(cells: Cells, cut: jax.Array, change: jax.Array, volume: jax.Array) 
 
 
 def start(scheme: Multilevel, marked: jax.Array) -> Cells:
-    """The cells of the finest grid: `Nothing` if each cell of every grid consists of four finer ones, else `Partial`."""
+    """The cells of the finest grid, whole if each cell of every grid consists of four finer ones."""
     rows, columns = marked.shape
     odd = 1 in marked.shape
     while min(rows, columns) >= 2 * scheme.coarsest:
         odd = odd or rows % 2 == 1 or columns % 2 == 1
         rows, columns = rows // 2, columns // 2
-    return Partial(halo(jnp.ones_like(marked), 0.0)) if odd else Nothing()
+    return PartialCells(halo(jnp.ones_like(marked), 0.0)) if odd else WholeCells()

@@ -16,28 +16,29 @@ import numpy as np
 from jax import lax
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.relaxation._integrate import March, Sand
-from jaxsand.relaxation.ghost_cells import Lost
+from jaxsand.relaxation._integrate import SweepLoop
+from jaxsand.relaxation.ghost_cells import ExactSum
+from jaxsand.relaxation.sweep import Swept
 
 _CELLS = 65_536  # cells in a chunk, whose sweep then works in a core's cache
 _LEFT = 8  # a chunk stops when one in so many of its maps still moves
 
 
-def march_batch(
-    march: March,
+def loop_batch(
+    loop: SweepLoop,
     groups: int,
-    enter: Callable[[jax.Array, Lost], Sand],
-    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
+    enter: Callable[[jax.Array, ExactSum | None], Swept],
+    judge: Callable[[jax.Array, Swept, jax.Array], Tree],
     height: jax.Array,
-    lost: Lost,
+    lost: ExactSum | None,
     chunk: int,
 ) -> Tree:
-    """`March.run` for every map of a batch [B, H, W], B a multiple of the chunk.
+    """`SweepLoop.run` for every map of a batch [B, H, W], B a multiple of the chunk.
 
     `enter(height, lost)` makes the sand of a map; `judge(height, sand, sweeps)` makes its result, which has a `height`.
     """
     total = height.shape[0]
-    run = partial(_together, march, groups, enter, judge)
+    run = partial(_together, loop, groups, enter, judge)
     fresh = (height, lost, jnp.zeros(total, jnp.int32), jnp.zeros(total, bool))
     chunks = jax.tree.map(lambda x: x.reshape(-1, chunk, *x.shape[1:]), fresh)
     state = lax.map(lambda some: run(total > chunk, *some), chunks)
@@ -49,9 +50,9 @@ def march_batch(
 
 def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
     """The state after chunks of the maps that still move were swept once more until few are left."""
-    _, _, taken, ready = state
-    order = jnp.argsort(jnp.where(ready, jnp.iinfo(jnp.int32).max, taken))
-    left = jnp.sum(~ready)
+    _, _, taken, ended = state
+    order = jnp.argsort(jnp.where(ended, jnp.iinfo(jnp.int32).max, taken))
+    left = jnp.sum(~ended)
 
     def one(i: jax.Array, state: Tree) -> Tree:
         who = lax.dynamic_slice(order, (i * chunk,), (chunk,))
@@ -63,42 +64,44 @@ def _left_over(run: Callable[..., Tree], chunk: int, state: Tree) -> Tree:
 
 
 def _together(
-    march: March,
+    loop: SweepLoop,
     groups: int,
-    enter: Callable[[jax.Array, Lost], Sand],
-    judge: Callable[[jax.Array, Sand, jax.Array], Tree],
+    enter: Callable[[jax.Array, ExactSum | None], Swept],
+    judge: Callable[[jax.Array, Swept, jax.Array], Tree],
     others: jax.Array | bool,
     height: jax.Array,
-    lost: Lost,
+    lost: ExactSum | None,
     taken: jax.Array,
-    ready: jax.Array,
+    ended: jax.Array,
 ) -> Tree:
-    """Sweeps the maps of a chunk until all are ready; where there are `others` to join, until all but a few are.
+    """Sweeps the maps of a chunk until all are still; where there are `others` to join, until all but a few are.
 
-    Returns for each map its result, what it lost, the number of groups of sweeps, and whether it is ready.
+    Returns for each map its result, what it lost, the number of groups of sweeps, and whether it has ended.
     """
-    few = ready.shape[0] // _LEFT
+    few = ended.shape[0] // _LEFT
 
     def look(k: jax.Array, moving: Tree) -> jax.Array:
-        return (k >= groups) | march.done(march.params, k, moving)
+        return (k >= groups) | loop.done(loop.params, k, moving)
 
     def goes_on(carry: Tree) -> jax.Array:
-        _, _, taken, ready = carry
-        aside = others & (jnp.sum(~ready) <= few) & jnp.all(ready | jax.vmap(march.between)(taken))
-        return ~jnp.all(ready) & ~aside
+        _, _, taken, ended = carry
+        aside = others & (jnp.sum(~ended) <= few) & jnp.all(ended | jax.vmap(loop.between)(taken))
+        return ~jnp.all(ended) & ~aside
 
     def advance(carry: Tree) -> Tree:
-        moving, sand, taken, ready = carry
-        moving = jax.vmap(partial(march.body, march.params))(taken, moving)
-        sand = jax.tree.map(lambda x, y: jnp.where(ready.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, moving[:2])
-        taken = taken + (~ready).astype(taken.dtype)
-        return moving, sand, taken, ready | jax.vmap(look)(taken, moving)
+        moving, sand, taken, ended = carry
+        moving = jax.vmap(partial(loop.body, loop.params))(taken, moving)
+        sand = jax.tree.map(
+            lambda x, y: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), x, y), sand, Swept(moving.height, moving.lost)
+        )
+        taken = taken + (~ended).astype(taken.dtype)
+        return moving, sand, taken, ended | jax.vmap(look)(taken, moving)
 
     sand = jax.vmap(enter)(height, lost)
-    moving = jax.vmap(march.begin)(sand)
-    ready = ready | jax.vmap(look)(taken, moving)
-    _, sand, taken, ready = lax.while_loop(goes_on, advance, (moving, sand, taken, ready))
-    return jax.vmap(judge)(height, sand, taken * march.interval), sand[1], taken, ready
+    moving = jax.vmap(loop.begin)(sand)
+    ended = ended | jax.vmap(look)(taken, moving)
+    _, sand, taken, ended = lax.while_loop(goes_on, advance, (moving, sand, taken, ended))
+    return jax.vmap(judge)(height, sand, taken * loop.interval), sand.lost, taken, ended
 
 
 def on_all_cores(run: Callable[..., Tree], others: Tree, batch: Tree, chunk: int | None) -> Tree:

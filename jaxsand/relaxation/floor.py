@@ -33,8 +33,8 @@ def no_more_than(neighbours: Neighbours, there: Float[Array, "H W ..."], moved: 
         given = given + (jnp.where(second > 0, second, 0) - jnp.where(first < 0, first, 0))
     short = given > there
     share = jnp.where(short, there / jnp.where(short, given, 1) * _LESS, 1)
-    around, out = halo(share, 1.0), []
+    shares, out = halo(share, 1.0), []
     for (di, dj, _), f in zip(links(neighbours), moved, strict=False):
-        here, beyond = ends(around, di, dj)
+        here, beyond = ends(shares, di, dj)
         out.append(truncate(f * jnp.where(f > 0, beyond, here)))
     return (*out, *(truncate(f * share) for f in moved[len(out) :]))

@@ -25,14 +25,14 @@ NARROW = 0.05  # the smallest open share that is divided by: a cell still less o
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Nothing:
+class WholeCells:
     """No tool stands in the sand, and every cell is whole."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Around:
-    """A tool that stands in the sand; see `stand`.
+class ToolInSand:
+    """A tool that stands in the sand; see `tool_in_sand`.
 
     Where a cell of mean height h above the tool's bottom b is partly covered, its sand stands in the open share, at the
     height h + stretch (h - b) with stretch = cover / open. A link is as open as the less open of its two cells, which keeps
@@ -55,7 +55,7 @@ class Around:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Partial:
+class PartialCells:
     """Cells of which only the share `open` can hold sand; maps then hold volume per cell area."""
 
     open: Float[Array, "H+2 W+2"]
@@ -66,19 +66,22 @@ class Partial:
         return volume / jnp.where(share > 0, share, 1)
 
 
-def stand(cover: Float[Array, "H W"], bottom: Float[Array, ""]) -> Around:
+Cells = WholeCells | PartialCells
+
+
+def tool_in_sand(cover: Float[Array, "H W"], bottom: Float[Array, ""]) -> ToolInSand:
     """A tool with its bottom at height `bottom` (m) whose footprint is `cover`, the share of each cell that it covers."""
     free = 1 - cover
-    return Around(halo(free, 0.0), cover / jnp.maximum(free, NARROW), bottom)
+    return ToolInSand(halo(free, 0.0), cover / jnp.maximum(free, NARROW), bottom)
 
 
-def fluxes(bed: Bed, around: Nothing | Partial, u: Float[Array, "H+2 W+2"]) -> Fluxes:
+def fluxes(bed: Bed, cells: Cells, u: Float[Array, "H+2 W+2"]) -> Fluxes:
     """The flux over every link of a map with ghost cells at rate 1 (m), positive towards the link's first cell.
 
-    The map holds heights or, in `Partial` cells, volumes per cell area. Where the edge drains, a last map [H, W] holds what
+    The map holds heights or, in `PartialCells`, volumes per cell area. Where the edge drains, a last map [H, W] holds what
     each cell loses over the rim.
     """
-    s, gate = (u, None) if isinstance(around, Nothing) else (halo(around.surface(at(u))), around.open)
+    s, gate = (u, None) if isinstance(cells, WholeCells) else (halo(cells.surface(at(u))), cells.open)
     return flows(bed, gate, s)
 
 
@@ -121,14 +124,14 @@ def fluxes_zero(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Fluxes:
     return (*maps, jnp.zeros_like(at(u))) if bed.rim is not None else tuple(maps)
 
 
-def worst_excess(bed: Bed, u: Float[Array, "H+2 W+2"], around: Nothing | Partial | None = None) -> Float[Array, ""]:
+def worst_excess(bed: Bed, u: Float[Array, "H+2 W+2"], cells: Cells | None = None) -> Float[Array, ""]:
     """The largest slope in excess of repose (a tangent) of a map with ghost cells; 0 where none exceeds it.
 
     In partial cells an excess counts only as far as it drives sand, so that it is 0 where nothing flows.
     """
     gate = None
-    if isinstance(around, Partial):
-        u, gate = halo(around.surface(at(u))), around.open
+    if isinstance(cells, PartialCells):
+        u, gate = halo(cells.surface(at(u))), cells.open
     worst = _highest(_excesses(bed, gate, u))
     if bed.rim is not None:
         drains = _draining_sides(bed.rim) > 0
@@ -162,7 +165,7 @@ def steepest(bed: Bed, u: Float[Array, "H+2 W+2"]) -> Float[Array, ""]:
 
 def _highest(maps: Iterable[jax.Array]) -> jax.Array:
     """The largest value in any of the maps, at least 0; NaN marks a missing link and is ignored."""
-    worst: Any = 0.0
+    worst: jax.Array | float = 0.0
     for e in maps:
         worst = jnp.where(e > worst, e, worst)
     return jnp.max(jnp.max(worst, axis=0))  # rows first: XLA vectorises that

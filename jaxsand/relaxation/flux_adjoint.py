@@ -21,14 +21,14 @@ Lattice = tuple[OnLattice, ...]  # for each direction of links
 _CORNERS = {(0, 1): (0, 1), (1, 0): (0, 2), (1, 1): (0, 3), (1, -1): (1, 2)}
 
 
-def _around(u: jax.Array) -> tuple[jax.Array, ...]:
+def _corners(u: jax.Array) -> tuple[jax.Array, ...]:
     """The four cells of a map with ghost cells that meet at each point of the lattice."""
     return u[:-1, :-1], u[:-1, 1:], u[1:, :-1], u[1:, 1:]
 
 
 def pairs(bed: Bed, u: Ghosted) -> list[tuple[OnLattice, OnLattice]]:
     """The values in the first and the second cell of every link, for each direction."""
-    cells = _around(u)
+    cells = _corners(u)
     return [(cells[_CORNERS[di, dj][0]], cells[_CORNERS[di, dj][1]]) for di, dj, _ in links(bed.neighbours)]
 
 
@@ -41,7 +41,7 @@ def gains(bed: Bed, flow: Lattice) -> Float[Array, "H W"]:
     """What each cell [H, W] gains from fluxes, which are positive towards the links' first cells."""
     net: jax.Array | float = 0.0
     for (di, dj, _), f in zip(links(bed.neighbours), flow, strict=True):
-        beside = _around(f)  # a cell is corner 3 of the point before it, and corner 0 of its own
+        beside = _corners(f)  # a cell is corner 3 of the point before it, and corner 0 of its own
         first, second = _CORNERS[di, dj]
         net = net + (beside[3 - first] - beside[3 - second])
     return jnp.asarray(net)
@@ -112,7 +112,7 @@ def to_less_open(bed: Bed, gate: Ghosted, parts: list[OnLattice]) -> Ghosted:
     for (di, dj, _), (here, there), part in zip(links(bed.neighbours), pairs(bed, gate), parts, strict=True):
         first, second = _CORNERS[di, dj]
         less = here <= there
-        net = net + _around(jnp.where(less, part, 0))[3 - first] + _around(jnp.where(less, 0, part))[3 - second]
+        net = net + _corners(jnp.where(less, part, 0))[3 - first] + _corners(jnp.where(less, 0, part))[3 - second]
     return halo(jnp.asarray(net), 0.0)
 
 

@@ -20,7 +20,19 @@ from jaxsand.scene.boundaries import Base, Draining, Walls
 from jaxsand.scene.grid import Neighbours
 from jaxsand.scene.scene import Scene
 
-Lost = tuple[jax.Array, jax.Array] | None
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ExactSum:
+    """An account of many small amounts: two floats, or maps of them, whose sum is exact far beyond the range of one."""
+
+    low: jax.Array
+    high: jax.Array
+
+    @property
+    def value(self) -> jax.Array:
+        """The sum as one float, rounded."""
+        return self.low + self.high
 
 
 @jax.tree_util.register_dataclass
@@ -157,25 +169,20 @@ def nearest(x: jax.Array) -> jax.Array:
 nearest.defjvps(lambda tangent, _, x: tangent)
 
 
-def lose(quantum: jax.Array, lost: tuple[jax.Array, jax.Array], amount: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Adds an amount [H, W], in whole quanta, to the account `lost` of what drained.
-
-    The account is a pair (low, high) of maps whose sum is exact far beyond the range of one float.
-    """
-    low, high = lost
-    low = low + amount
+def lose(quantum: jax.Array, lost: ExactSum, amount: jax.Array) -> ExactSum:
+    """Adds an amount [H, W], in whole quanta, to the account `lost` of what drained from each cell."""
+    low = lost.low + amount
     coarse = quantum * 4096
     carry = truncate(low / coarse) * coarse
-    return low - carry, high + carry
+    return ExactSum(low - carry, lost.high + carry)
 
 
-def counted(account: tuple[jax.Array, jax.Array], amount: Float[Array, "m n ..."]) -> tuple[jax.Array, jax.Array]:
-    """Adds the sum of a map of whole quanta to an account (low, high), a pair of numbers of quanta whose sum is exact.
+def counted(account: ExactSum, amount: Float[Array, "m n ..."]) -> ExactSum:
+    """Adds the sum of a map of whole quanta to an account, in quanta.
 
     The cells are summed as whole numbers in digits of 11 bits, rows first, so that no sum overflows on maps of up to 2^18
     columns. The account is exact up to 2^46 quanta in float32. The derivative is that of the sum of floats.
     """
-    low, high = account
     total = jnp.sum(jnp.sum(amount, axis=0), axis=0)
     exact = lax.stop_gradient(amount)
     whole = jnp.int64 if amount.dtype == jnp.float64 else jnp.int32
@@ -185,21 +192,21 @@ def counted(account: tuple[jax.Array, jax.Array], amount: Float[Array, "m n ..."
     third, second, first = (jnp.sum(x, axis=0) for x in (second >> 11, second & 2047, first))
     second, first = second + (first >> 11), first & 2047
     third, second = third + (second >> 11), second & 2047
-    low = low + (second * 2048 + first).astype(low.dtype) + (total - lax.stop_gradient(total))
+    low = account.low + (second * 2048 + first).astype(account.low.dtype) + (total - lax.stop_gradient(total))
     carry = lax.stop_gradient(jnp.floor(low / 2**22))
-    return low - 2**22 * carry, high + 2**22 * (third.astype(high.dtype) + carry)
+    return ExactSum(low - 2**22 * carry, account.high + 2**22 * (third.astype(low.dtype) + carry))
 
 
-def nothing_lost(bed: Bed, height: jax.Array) -> Lost:
+def nothing_lost(bed: Bed, height: jax.Array) -> ExactSum | None:
     """The account of `lose` before anything drained; None if the edge is closed."""
-    return None if bed.rim is None else (jnp.zeros_like(height), jnp.zeros_like(height))
+    return None if bed.rim is None else ExactSum(jnp.zeros_like(height), jnp.zeros_like(height))
 
 
-def volume_lost(bed: Bed, lost: Lost) -> Float[Array, ""]:
+def volume_lost(bed: Bed, lost: ExactSum | None) -> Float[Array, ""]:
     """The volume that drained (m^3)."""
     if lost is None:
         return jnp.zeros_like(bed.spacing)
-    return (jnp.sum(lost[1]) + jnp.sum(lost[0])) * bed.spacing**2
+    return (jnp.sum(lost.high) + jnp.sum(lost.low)) * bed.spacing**2
 
 
 def halo(x: Float[Array, "H W ..."], value: float = jnp.nan) -> Float[Array, "H+2 W+2 ..."]:

@@ -10,13 +10,13 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxsand.relaxation._integrate import March, Sand, march
+from jaxsand.relaxation._integrate import SweepLoop, sweep_loop
 from jaxsand.relaxation._multigrid import descend, start
-from jaxsand.relaxation.batching import march_batch, on_all_cores, wide_vectors
-from jaxsand.relaxation.flux import Nothing, middle, steepest, worst_excess
+from jaxsand.relaxation.batching import loop_batch, on_all_cores, wide_vectors
+from jaxsand.relaxation.flux import WholeCells, middle, steepest, worst_excess
 from jaxsand.relaxation.ghost_cells import (
     Bed,
-    Lost,
+    ExactSum,
     at,
     below_base,
     halo,
@@ -31,6 +31,7 @@ from jaxsand.relaxation.ghost_cells import (
 )
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, schedule, stable_rate
 from jaxsand.relaxation.stopping import Outcome, Stop, Sweeps, as_batch, check_chunk, check_rule, check_settling_window, said
+from jaxsand.relaxation.sweep import Swept
 from jaxsand.scene.scene import Scene, cast, fit
 from jaxsand.scene.window import Whole, Window, cut, edge_movement, near_edge, origin, paste
 
@@ -202,7 +203,7 @@ def _steepest(scene: Scene, height: jax.Array) -> jax.Array:
 def relax(scene: Scene, height: Float[Array, "H W"], scheme: Scheme, stop: Stop, window: Whole | Window = _WHOLE) -> Settled:
     """`settle` without its checks and casts, for use inside a compiled program."""
     bed = prepare(scene)
-    sand = (halo(mark(scene, height)[0]), nothing_lost(bed, height))
+    sand = Swept(halo(mark(scene, height)[0]), nothing_lost(bed, height))
     if isinstance(window, Window):
         sand, sweeps, touched = _in_window(scene, bed, window, scheme, stop, sand)
     else:
@@ -214,16 +215,16 @@ def relax(scene: Scene, height: Float[Array, "H W"], scheme: Scheme, stop: Stop,
 def run_off(scene: Scene, height: Float[Array, "H W"], scheme: Scheme, stop: Stop) -> tuple[jax.Array, jax.Array]:
     """The map after settling, and what each of its cells lost over the draining edge (m); inside a compiled program."""
     bed = prepare(scene)
-    (u, lost), _ = _run(scene, bed, scheme, stop, (halo(mark(scene, height)[0]), nothing_lost(bed, height)))
-    assert lost is not None
-    return at(u), lost[0] + lost[1]
+    sand, _ = _run(scene, bed, scheme, stop, Swept(halo(mark(scene, height)[0]), nothing_lost(bed, height)))
+    assert sand.lost is not None
+    return at(sand.height), sand.lost.value
 
 
 def _judge(
-    scene: Scene, bed: Bed, stop: Stop, height: jax.Array, sand: Sand, sweeps: jax.Array, touched: jax.Array
+    scene: Scene, bed: Bed, stop: Stop, height: jax.Array, sand: Swept, sweeps: jax.Array, touched: jax.Array
 ) -> Settled:
     """The result for a map that was `height` before settling and is now `sand`."""
-    u, lost = sand
+    u = sand.height
     marked, broken = mark(scene, height)
     residual = worst_excess(bed, u)
     broken = broken | spoiled(marked, at(u)) | ~sound(bed)
@@ -231,22 +232,22 @@ def _judge(
     outcome = still | said(Outcome.WINDOW_EDGE, touched) | said(Outcome.NOT_FINITE, broken)
     outcome = outcome | said(Outcome.BELOW_BASE, below_base(bed, marked))
     settled = unmark(at(u), height)
-    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome, volume_lost(bed, lost))
+    return Settled(settled, sweeps, lax.stop_gradient(residual), outcome, volume_lost(bed, sand.lost))
 
 
-def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Sand) -> tuple[Sand, jax.Array]:
+def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Swept) -> tuple[Swept, jax.Array]:
     """The sand after the stop rule is satisfied, and the number of sweeps taken."""
     bound, interval = _groups(stop)
     if isinstance(scheme, Multilevel):
         tolerance = jnp.asarray(stop.tolerance)
-        return descend(bed, start(scheme, at(sand[0])), scheme, stable_rate(scene), tolerance, bound, interval, sand)
-    return _march(scene, bed, scheme, stop).run(bound // interval, sand)
+        return descend(bed, start(scheme, at(sand.height)), scheme, stable_rate(scene), tolerance, bound, interval, sand)
+    return _sweep_loop(scene, bed, scheme, stop).run(bound // interval, sand)
 
 
-def _march(scene: Scene, bed: Bed, scheme: OnOneGrid, stop: Stop) -> March:
+def _sweep_loop(scene: Scene, bed: Bed, scheme: OnOneGrid, stop: Stop) -> SweepLoop:
     bound, interval = _groups(stop)
     plan = schedule(scheme, stable_rate(scene), bound, interval) if isinstance(scheme, SuperTimeStepping) else scheme
-    return march(bed, Nothing(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
+    return sweep_loop(bed, WholeCells(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
 
 
 def _groups(stop: Stop) -> tuple[int, int]:
@@ -257,21 +258,21 @@ def _groups(stop: Stop) -> tuple[int, int]:
 
 
 def _in_window(
-    scene: Scene, bed: Bed, window: Window, scheme: Scheme, stop: Stop, sand: Sand
-) -> tuple[Sand, jax.Array, jax.Array]:
+    scene: Scene, bed: Bed, window: Window, scheme: Scheme, stop: Stop, sand: Swept
+) -> tuple[Swept, jax.Array, jax.Array]:
     """`_run` on the block around what is too steep; also whether sand moves outside of it or near its edge."""
-    u, lost = sand
-    shape, h = scene.grid.shape, at(u)
-    begin = origin(window, shape, middle(bed, u, jnp.asarray(stop.tolerance)))
-    block, block_lost = cut(window, shape, begin, (h, lost))
+    shape, h = scene.grid.shape, at(sand.height)
+    begin = origin(window, shape, middle(bed, sand.height, jnp.asarray(stop.tolerance)))
+    block, block_lost = cut(window, shape, begin, (h, sand.lost))
     outside = paste(begin, h, jnp.where(near_edge(window, shape, begin), block, jnp.nan))
     restless = worst_excess(bed, halo(outside)) > window.tolerance
     elsewhere = jnp.maximum(bed.elsewhere, largest(paste(begin, h, jnp.zeros_like(block))))
     here = replace(cut(window, shape, begin, bed), elsewhere=elsewhere)
-    (after, block_lost), sweeps = _run(scene, here, scheme, stop, (halo(block), block_lost))
-    change = edge_movement(window, shape, begin, block, at(after), jnp.zeros_like(block))
+    after, sweeps = _run(scene, here, scheme, stop, Swept(halo(block), block_lost))
+    change = edge_movement(window, shape, begin, block, at(after.height), jnp.zeros_like(block))
     touched = restless | (change > window.tolerance * bed.spacing)
-    return (halo(paste(begin, h, at(after))), paste(begin, lost, block_lost)), sweeps, touched
+    whole = Swept(halo(paste(begin, h, at(after.height))), paste(begin, sand.lost, after.lost))
+    return whole, sweeps, touched
 
 
 _settle = jax.jit(relax)
@@ -284,12 +285,12 @@ def relax_batch(rules: tuple[Scene, Scheme, Stop, Whole | Window], height: Float
         return lax.map(lambda h: relax(scene, h, scheme, stop, window), height, batch_size=chunk)
     bed, (bound, interval) = prepare(scene), _groups(stop)
 
-    def enter(h: jax.Array, lost: Lost) -> Sand:
-        return halo(mark(scene, h)[0]), lost
+    def enter(h: jax.Array, lost: ExactSum | None) -> Swept:
+        return Swept(halo(mark(scene, h)[0]), lost)
 
-    way = _march(scene, bed, scheme, stop)
+    loop = _sweep_loop(scene, bed, scheme, stop)
     judge = partial(_judge, scene, bed, stop, touched=jnp.zeros((), bool))
-    return march_batch(way, bound // interval, enter, judge, height, nothing_lost(bed, height), chunk)
+    return loop_batch(loop, bound // interval, enter, judge, height, nothing_lost(bed, height), chunk)
 
 
 @cache

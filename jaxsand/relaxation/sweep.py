@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from jaxsand.autodiff.while_loop import Plain, Tree, split
 from jaxsand.relaxation import flux_adjoint
 from jaxsand.relaxation.floor import held, no_more_than
-from jaxsand.relaxation.flux import Fluxes, Nothing, Partial, fluxes, gained
-from jaxsand.relaxation.ghost_cells import Bed, Lost, at, halo, lose, truncate
+from jaxsand.relaxation.flux import Cells, Fluxes, PartialCells, WholeCells, fluxes, gained
+from jaxsand.relaxation.ghost_cells import Bed, ExactSum, at, halo, lose, truncate
 
 Ghosted = Float[Array, "H+2 W+2"]  # a map with ghost cells
 
@@ -25,13 +25,58 @@ class Flow:
     quantum: Float[Array, ""]
 
 
-def sweep(bed: Bed, flow: Flow, around: Nothing | Partial, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
-    """One sweep of a map with ghost cells [H + 2, W + 2], by forward Euler.
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Swept:
+    """The sand that is swept.
 
-    `lost` adds up the height that each cell lost over a draining rim (see `lose`); it is None where the edge is closed.
+    Attributes:
+        height: a map with ghost cells.
+        lost: the height that each cell lost over a draining rim so far (see `lose`), None where the edge is closed.
     """
-    moved = within(bed, flow, counted(flow, fluxes(bed, around, u)), at(u))
-    return apply(bed, flow, moved, u, lost)
+
+    height: Ghosted
+    lost: ExactSum | None
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RklState(Swept):
+    """The sand, and `last`: what each link moved in the last stage."""
+
+    last: Fluxes
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Limits:
+    """When sand counts as still.
+
+    Attributes:
+        tolerance: the slope above repose, a tangent, that counts as still.
+        per_quantum: the excess slope below which fluxes may be cut to 0, per quantum (1/m).
+    """
+
+    tolerance: jax.Array
+    per_quantum: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class GroupParams:
+    """What a group of sweeps depends on: the bed, its cells, when the sand is still (None: never), and the sweeps' rate
+    (None where a schedule has it)."""
+
+    bed: Bed
+    cells: Cells
+    limits: Limits | None
+    rate: jax.Array | float | None
+
+
+def sweep(bed: Bed, flow: Flow, cells: Cells, sand: Swept) -> Swept:
+    """One sweep, by forward Euler."""
+    moved = within(bed, flow, counted(flow, fluxes(bed, cells, sand.height)), at(sand.height))
+    return apply(bed, flow, moved, sand)
 
 
 def counted(flow: Flow, driven: Fluxes) -> Fluxes:
@@ -47,31 +92,28 @@ def within(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"]) -> Fluxe
     return lax.optimization_barrier(no_more_than(bed.neighbours, held(h, bed.base, flow.quantum), moved))
 
 
-def surge(
-    bed: Bed, flow: Flow, momentum: Float[Array, ""], around: Nothing | Partial, state: tuple[Ghosted, Lost, Fluxes]
-) -> tuple[Ghosted, Lost, Fluxes]:
-    """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before.
-
-    The state is a map with ghost cells, its account of losses, and what links moved last (in quanta).
-    """
-    u, lost, last = state
+def rkl_stage(bed: Bed, flow: Flow, momentum: Float[Array, ""], cells: Cells, state: RklState) -> RklState:
+    """An RKL stage: a sweep that also repeats the share `momentum` of what each link moved in the stage before (quanta)."""
     scale = flow.rate / flow.quantum
-    moved = tuple(truncate(f * scale) + truncate(m * momentum) for f, m in zip(fluxes(bed, around, u), last, strict=True))
-    moved = within(bed, flow, lax.optimization_barrier(moved), at(u))
-    u, lost = apply(bed, flow, moved, u, lost)
-    return u, lost, moved
+    driven = zip(fluxes(bed, cells, state.height), state.last, strict=True)
+    moved = tuple(truncate(f * scale) + truncate(m * momentum) for f, m in driven)
+    moved = within(bed, flow, lax.optimization_barrier(moved), at(state.height))
+    sand = apply(bed, flow, moved, state)
+    return RklState(sand.height, sand.lost, moved)
 
 
-def apply(bed: Bed, flow: Flow, moved: Fluxes, u: Ghosted, lost: Lost) -> tuple[Ghosted, Lost]:
-    """The map with ghost cells after `moved` quanta crossed its links.
+def apply(bed: Bed, flow: Flow, moved: Fluxes, sand: Swept) -> Swept:
+    """The sand after `moved` quanta crossed the links.
 
     `moved` must be stored, behind a barrier, so that both ends of a link use the same number.
     """
-    h, lost = pass_over(bed, flow, moved, at(u), lost)
-    return halo(h), lost
+    h, lost = pass_over(bed, flow, moved, at(sand.height), sand.lost)
+    return Swept(halo(h), lost)
 
 
-def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"], lost: Lost) -> tuple[Float[Array, "H W"], Lost]:
+def pass_over(
+    bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"], lost: ExactSum | None
+) -> tuple[Float[Array, "H W"], ExactSum | None]:
     """`apply` for a map [H, W] without ghost cells."""
     if lost is not None:
         lost = lose(flow.quantum, lost, moved[-1] * flow.quantum)
@@ -79,40 +121,34 @@ def pass_over(bed: Bed, flow: Flow, moved: Fluxes, h: Float[Array, "H W"], lost:
 
 
 class Sweep(Plain):
-    """A sweep as a step of a loop. `params` are the bed, the flow and the cells; the state is a map and its losses."""
+    """A sweep as a step of a loop. `params` are the bed, the flow and the cells; the state is the sand."""
 
     def __init__(self) -> None:
-        super().__init__(lambda params, _, state: sweep(*params, *state))
+        super().__init__(lambda params, _, sand: sweep(params[0], params[1], params[2], sand))
 
-    def pull(
-        self,
-        params: tuple[Bed, Flow, Nothing | Partial],
-        k: jax.Array,
-        record: tuple[jax.Array, Lost],
-        cotangent: tuple[jax.Array, Lost],
-    ) -> tuple[Tree, tuple[jax.Array, Lost]]:
+    def vjp(self, params: tuple[Bed, Flow, Cells], k: jax.Array, record: Swept, cotangent: Swept) -> tuple[Tree, Swept]:
         """The vjp, with 4 or 8 neighbours, a closed edge and no floor by the formulas of flux_adjoint.py, else by JAX."""
-        bed, flow, around = params
+        bed, flow, cells = params
         if not bed.by_links:
-            return super().pull(params, k, record, cotangent)
-        h, gain = at(record[0]), at(cotangent[0])
-        s = record[0] if isinstance(around, Nothing) else halo(around.surface(h))
-        gate = None if isinstance(around, Nothing) else around.open
+            return super().vjp(params, k, record, cotangent)
+        h, gain = at(record.height), at(cotangent.height)
+        s = record.height if isinstance(cells, WholeCells) else halo(cells.surface(h))
+        gate = None if isinstance(cells, WholeCells) else cells.open
         d, m, weights = flux_adjoint.steps(bed, s), flux_adjoint.yields(bed), flux_adjoint.opened(bed, gate)
         back = flux_adjoint.steps(bed, halo(gain, 0.0))
         onward, of_yield, of_rate = [], [], []
         for step, most, w, y in zip(d, m, weights, back, strict=True):
             up, down = step > most, step < -most
-            pulled = flow.rate * w * y
-            onward.append(jnp.where(up | down, pulled, 0))
-            of_yield.append(jnp.where(up, pulled, jnp.where(down, -pulled, 0)))
+            passed = flow.rate * w * y
+            onward.append(jnp.where(up | down, passed, 0))
+            of_yield.append(jnp.where(up, passed, jnp.where(down, -passed, 0)))
             excess = jnp.where(up, step - most, jnp.where(down, step + most, 0)) * y
             of_rate.append(excess * w)
         slope = flux_adjoint.gains(bed, lax.optimization_barrier(tuple(onward)))
-        dbed, dflow, daround = jax.tree.map(jnp.zeros_like, params)
+        dbed, dflow, dcells = jax.tree.map(jnp.zeros_like, params)
         dbed = replace(dbed, drop=flux_adjoint.drop_cotangent(bed, of_yield))
         dflow = replace(dflow, rate=-jnp.sum(sum(of_rate)))
-        if isinstance(around, Partial):
-            share = at(around.open)
+        if isinstance(cells, PartialCells):
+            share = at(cells.open)
             slope = slope / jnp.where(share > 0, share, 1)
-        return split((dbed, dflow, daround))[0], (halo(gain + slope, 0.0), None)
+        return split((dbed, dflow, dcells))[0], Swept(halo(gain + slope, 0.0), None)

@@ -200,7 +200,7 @@ class _Search:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Ends:
+class SearchEnds:
     """Where the searches from S starts ended.
 
     Attributes:
@@ -226,7 +226,7 @@ def climb(
     size: int,
     seen: jax.Array,
     noise: jax.Array,
-) -> Ends:
+) -> SearchEnds:
     """Minimises the squared residuals from every start [S, P], in units of the ranges.
 
     Args:
@@ -281,12 +281,12 @@ def climb(
     begin = _Search(starts, Look(starts, r, jacobian, no), damping, no, looks)
     end = lax.while_loop(goes_on, jax.vmap(advance), begin)
     at = end.kept
-    return Ends(at.x, jnp.sum(at.residual * at.residual, axis=1), at.jacobian, at.clean, end.done, end.looks)
+    return SearchEnds(at.x, jnp.sum(at.residual * at.residual, axis=1), at.jacobian, at.clean, end.done, end.looks)
 
 
 def conclude(
     ranges: list[Range],
-    ends: Ends,
+    ends: SearchEnds,
     seen: int,
     noise: float | None,
     calls: int,

@@ -25,9 +25,9 @@ from jaxsand.scene.tools import NoTool
 from jaxsand.scene.validation import concrete
 from jaxsand.terramechanics._least_squares import (
     Calibration,
-    Ends,
     Free,
     Range,
+    SearchEnds,
     as_ranges,
     check_noise,
     climb,
@@ -182,7 +182,7 @@ def _climbs(
     seen: jax.Array,
     noise: jax.Array,
     names: tuple[str, ...],
-) -> Ends:
+) -> SearchEnds:
     """Fits from every start `begin` [starts, P], in units of the ranges `box` [2, P] (their low ends, their high ends)."""
 
     def residuals(x: jax.Array) -> tuple[jax.Array, jax.Array]:

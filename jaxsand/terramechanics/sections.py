@@ -13,7 +13,16 @@ from scipy.optimize import least_squares
 
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.masked import gaps
-from jaxsand.terramechanics._least_squares import Calibration, Ends, Free, Range, as_ranges, check_noise, conclude, spread
+from jaxsand.terramechanics._least_squares import (
+    Calibration,
+    Free,
+    Range,
+    SearchEnds,
+    as_ranges,
+    check_noise,
+    conclude,
+    spread,
+)
 from jaxsand.terramechanics.wheel_trench import Pass, Profile, relaxing
 
 _SHARED = ("repose_angle", "radius", "width")
@@ -145,7 +154,7 @@ def calibrate_sections(
     def passes(values: np.ndarray) -> tuple[Pass, ...]:
         return tuple(_placed(section.run, k, keys, values)[0] for k, section in enumerate(some))
 
-    found = Ends(
+    found = SearchEnds(
         x=np.array([end.x - 1 for end in ends]),
         cost=np.array([2 * end.cost for end in ends]),
         jacobian=np.array([end.jac for end in ends]),

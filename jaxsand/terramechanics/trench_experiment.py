@@ -29,6 +29,8 @@ from jaxsand.scene.window import Window
 from jaxsand.terramechanics.scans import Scan, compare, measured_profile
 from jaxsand.terramechanics.wheel_trench import Pass, Profile, closed_form, relaxed
 
+Figures = dict[str, Any]  # what was found of one case, by name
+
 Trench = tuple[float, float]  # slip angle (degrees), sinkage (mm)
 ANGLES = (0.0, 22.5, 45.0, 67.5, 90.0)
 SINKAGES = (5.0, 15.0, 25.0)
@@ -129,7 +131,7 @@ def references(trenches: Iterable[Trench]) -> dict[str, dict[Trench, Profile]]:
 
 def compare_with_scans(
     ruts: dict[Trench, Rut], scans: dict[Trench, list[Scan]]
-) -> tuple[list[dict[str, Any]], dict[Trench, Profile]]:
+) -> tuple[list[Figures], dict[Trench, Profile]]:
     """Compares simulated trenches with scans of them.
 
     Returns:
@@ -164,7 +166,7 @@ def experiment(
     rules: Iterable[str] = tuple(RULES),
     scans: dict[Trench, list[Scan]] | None = None,
     tell: Tell = quiet,
-) -> tuple[dict[str, Any], dict[str, dict[Trench, Profile]]]:
+) -> tuple[Figures, dict[str, dict[Trench, Profile]]]:
     """Simulates all fifteen trenches with each rule, and compares them.
 
     Args:
@@ -180,7 +182,7 @@ def experiment(
     """
     known = references(TRENCHES)
     profiles: dict[str, dict[Trench, Profile]] = dict(known)
-    rows: list[dict[str, Any]] = []
+    rows: list[Figures] = []
     scans = scans or {}
     for rule in rules:
         ruts = simulate_all(dict.fromkeys([*TRENCHES, *scans]), spacing, RULES[rule], tell)
@@ -216,7 +218,7 @@ def _named(trench: Trench) -> dict[str, float]:
     return {"beta_deg": trench[0], "sinkage_mm": trench[1]}
 
 
-def _means(rows: list[dict[str, Any]], **of: float) -> dict[str, dict[str, dict[str, float]]]:
+def _means(rows: list[Figures], **of: float) -> dict[str, dict[str, dict[str, float]]]:
     """The figures averaged over the rows that have the given values: {rule: {reference: figures}}."""
     some = [row for row in rows if all(row[key] == value for key, value in of.items())]
     table: dict[str, dict[str, dict[str, float]]] = {}

@@ -1,7 +1,7 @@
 """Animations of a bucket at work: the sand from above, and beside it what the bucket holds."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from jaxsand.viz.render import lit
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+
+    from jaxsand.interaction.bucket import Loaded
 
 _INK, _PAPER, _SAND = (30, 30, 40), (250, 249, 246), (204, 168, 112)
 _BAR = 84  # pixels beside the map
@@ -61,7 +63,7 @@ def save_bucket_animation(
     )
 
 
-def bucket_frame(scene: Scene, loaded: Any) -> tuple[np.ndarray, float, np.ndarray]:
+def bucket_frame(scene: Scene, loaded: "Loaded") -> tuple[np.ndarray, float, np.ndarray]:
     """A frame for `save_bucket_animation` from what `scoop` or `dump` returned."""
     from jaxsand.interaction.bucket import load_volume
 

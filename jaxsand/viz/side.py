@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,16 +63,26 @@ def side_figure(scene: Scene, maps: Maps, path: ArrayLike, title: str = "") -> "
     return figure
 
 
-def sides_figure(shown: Sequence[tuple[str, Scene, Mapping[str, np.ndarray], ArrayLike]]) -> "Figure":
-    """As `side_figure`, a line for each of several: its name, scene, maps by name, and path."""
+@dataclass(frozen=True)
+class Side:
+    """A line of `sides_figure`: its title, the scene, maps [H, W] (m) by name, and a path [n, 2] or [n, 3] (m)."""
+
+    title: str
+    scene: Scene
+    maps: Maps
+    path: ArrayLike
+
+
+def sides_figure(shown: Sequence[Side]) -> "Figure":
+    """As `side_figure`, a line for each of several."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 2.6 * len(shown) + 0.4), layout="constrained")
     lines = figure.subplots(len(shown), 2, squeeze=False, sharey="row", width_ratios=[2, 1])
-    for (along, across), (name, scene, maps, path) in zip(lines, shown, strict=True):
-        draw_along(along, scene, maps, path)
-        draw_across(across, scene, maps, path)
-        along.set_title(name, loc="left", fontsize=10, parse_math=False)
+    for (along, across), side in zip(lines, shown, strict=True):
+        draw_along(along, side.scene, side.maps, side.path)
+        draw_across(across, side.scene, side.maps, side.path)
+        along.set_title(side.title, loc="left", fontsize=10, parse_math=False)
         along.set_ylabel("height (mm)")
     figure.legend(*lines[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     return figure

@@ -8,11 +8,11 @@ import pytest
 
 from jaxsand.__main__ import main
 from jaxsand.bench import gradients as gradbench
-from jaxsand.bench.gradient_checks import Case
+from jaxsand.bench.gradient_checks import GradientCase
 from jaxsand.bench.report import table
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
 
-SMALL = (Case(False),)
+SMALL = (GradientCase(False),)
 
 
 @pytest.fixture(scope="module")

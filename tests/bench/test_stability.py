@@ -42,7 +42,7 @@ def test_the_judge_is_not_blind():
     case = next(c for c in suite.cases(8) if c.name == "angle 29 deg")
     for harm in (lambda h: h.at[3, 3].add(1e-3).at[9, 9].add(-1e-3), lambda h: h.at[3, 3].add(-1e-6), lambda h: h * 40):
 
-        class Harmed(suite.Case):
+        class Harmed(suite.SettlingCase):
             def settle(self, height, harm=harm):
                 settled = super().settle(height)
                 return replace(settled, height=harm(settled.height))

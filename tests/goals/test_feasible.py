@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import linprog
 
 import jaxsand as js
-from jaxsand.goals.feasible import Cells, _ground, _iterates, at_best, lagrangian
+from jaxsand.goals.feasible import CellCosts, _iterates, _limits, at_best, lagrangian
 from jaxsand.goals.goal import as_goal
 
 SHAPE, DX = (9, 12), 0.01
@@ -43,11 +43,11 @@ def scene_of(kind):
 
 def multipliers(scene, start, goal):
     """The limits and costs of a programme, and the solver's last map and multipliers."""
-    ground, goal = _ground(scene, start, 1e-3), as_goal(scene, goal)
-    cells = Cells(*(np.asarray(x)[ground.sand] for x in (goal.height, goal.above, goal.below)), goal.power)
-    for k, found in enumerate(_iterates(ground, cells)):
+    limits, goal = _limits(scene, start, 1e-3), as_goal(scene, goal)
+    cells = CellCosts(*(np.asarray(x)[limits.sand] for x in (goal.height, goal.above, goal.below)), goal.power)
+    for k, found in enumerate(_iterates(limits, cells)):
         if k == 12:
-            return ground, cells, found
+            return limits, cells, found
     raise AssertionError
 
 
@@ -140,13 +140,13 @@ def test_where_the_programme_allows_too_much_the_bound_still_holds(kind):
 def test_any_multipliers_give_a_bound(kind, goal):
     """The solver's own come near the cost, and no others, however wrong, get above it."""
     scene, rng = scene_of(kind), np.random.default_rng(2)
-    ground, cells, (h, flow, price) = multipliers(scene, LEVEL, goal)
-    best = float(cells.cost(ground.feasible(h)).sum())
-    level = float(cells.cost(ground.feasible(np.zeros_like(h))).sum())
-    assert 0.98 * best < lagrangian(ground, cells, flow, price, level) <= best
+    limits, cells, (h, flow, price) = multipliers(scene, LEVEL, goal)
+    best = float(cells.cost(limits.feasible(h)).sum())
+    level = float(cells.cost(limits.feasible(np.zeros_like(h))).sum())
+    assert 0.98 * best < lagrangian(limits, cells, flow, price, level) <= best
     for size in (1e-3, 0.03, 1, 30):
         wrong = flow * (1 + size * rng.normal(size=flow.shape)) + size * 1e-2 * np.abs(flow).max() * rng.normal()
-        assert lagrangian(ground, cells, wrong, price * (1 + size * rng.normal()), level) <= best
+        assert lagrangian(limits, cells, wrong, price * (1 + size * rng.normal()), level) <= best
 
 
 def test_another_solver_finds_the_same():

@@ -8,7 +8,7 @@ import pytest
 import jaxsand as js
 from jaxsand.autodiff.while_loop import repeat
 from jaxsand.interaction._contact_sweeps import Beside
-from jaxsand.relaxation.flux import stand
+from jaxsand.relaxation.flux import tool_in_sand
 from jaxsand.relaxation.ghost_cells import prepare, quantum
 from jaxsand.relaxation.sweep import Flow
 
@@ -44,7 +44,7 @@ def test_sweeps_around_a_tool_that_stands_in_the_sand():
     cover = rng.uniform(0.1, 0.8, SHAPE)
 
     def loss(height, cover, bottom, rate):
-        params = bed, Flow(rate, quantum(jnp.asarray(1.0))), stand(cover, bottom)
+        params = bed, Flow(rate, quantum(jnp.asarray(1.0))), tool_in_sand(cover, bottom)
         return jnp.sum(WEIGHTS * repeat(Beside(3), 1, params, (height, None))[0])
 
     central(loss, tuple(jnp.asarray(v, float) for v in (rng.normal(0, 0.01, SHAPE), cover, -0.0061, 0.11)))

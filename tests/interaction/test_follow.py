@@ -133,6 +133,6 @@ def test_schemes_that_depend_on_where_the_map_begins_settle_the_whole_map():
     scene = js.make_scene((200, 200), 0.01, ANGLE, tool=js.Blade())
     part = next(simulate.windows_for(scene, js.SteppedPush()))
     path = np.array([[0.98, 1.0], [1.06, 1.02]])
-    assert isinstance(simulate._around(part, path, js.SuperTimeStepping()), js.Window)
+    assert isinstance(simulate._settling_window(part, path, js.SuperTimeStepping()), js.Window)
     for scheme in (js.Pairwise(), js.Multilevel()):
-        assert isinstance(simulate._around(part, path, scheme), js.Whole)
+        assert isinstance(simulate._settling_window(part, path, scheme), js.Whole)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.bench.gradient_checks import Case, against_differences
+from jaxsand.bench.gradient_checks import GradientCase, against_differences
 from jaxsand.bench.gradients import CASES
 
 SHAPE = (12, 12)
@@ -149,7 +149,7 @@ def check_smooth_points(case, least, most):
 
 @pytest.mark.slow
 def test_gradients_are_right_at_fifty_smooth_points():
-    check_smooth_points(Case(True), 50, 300)
+    check_smooth_points(GradientCase(True), 50, 300)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from jaxsand.planning.binary.bound import block_bound
 from jaxsand.planning.binary.exact import exact
 from jaxsand.planning.binary.improve import improved
 from jaxsand.planning.binary.plans import walk_cost
-from jaxsand.planning.binary.sweepline import Ends, Sweep, steps_of
+from jaxsand.planning.binary.sweepline import LineSweep, WalkEnds, steps_of
 
 ENGINES = ("astar", "exact", "anytime")
 
@@ -307,10 +307,10 @@ def test_wide_blocks_are_bounded_by_degrees_honestly():
         start = (0, 0)
         board = make_problem(dig, start).board
         for block in blocks_of(board.near):
-            for ends in (Ends(0, True, 1, dict.fromkeys(block.cells[1:], 0)), Ends(0, False, 0, {})):
+            for ends in (WalkEnds(0, True, 1, dict.fromkeys(block.cells[1:], 0)), WalkEnds(0, False, 0, {})):
                 if 0 in block.cells and not block.bridge:
                     steps = steps_of(block, board.cells)
-                    tour = Sweep(block, steps, ends, relaxed.rest_of(steps, ends, board.colour, lambda: None)).search(
+                    tour = LineSweep(block, steps, ends, relaxed.rest_of(steps, ends, board.colour, lambda: None)).search(
                         500, lambda: None
                     )
                     assert tour.lower_bound <= tour.cost

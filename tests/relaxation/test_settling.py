@@ -216,10 +216,10 @@ def test_outcome_names_a_bound_that_is_too_small():
 @pytest.mark.parametrize(("neighbours", "limit"), [(4, 1 / 4), (8, 1 / (2 + 2 * math.sqrt(2)))])
 def test_the_stable_range_is_where_the_checkerboard_stops_shrinking(neighbours, limit):
     """Just inside the range a steep checkerboard calms down; just outside it is refused, and would grow."""
-    from jaxsand.relaxation.flux import Nothing
+    from jaxsand.relaxation.flux import WholeCells
     from jaxsand.relaxation.ghost_cells import at, halo, prepare, quantum
     from jaxsand.relaxation.settling import relax
-    from jaxsand.relaxation.sweep import Flow, sweep
+    from jaxsand.relaxation.sweep import Flow, Swept, sweep
 
     # Rows of alternating sign for 8 neighbours, the full checkerboard for 4: the fastest-growing modes.
     i, j = np.indices((16, 16))
@@ -228,10 +228,10 @@ def test_the_stable_range_is_where_the_checkerboard_stops_shrinking(neighbours, 
     bed = prepare(scene)
 
     def growth(rate):
-        u = halo(jnp.asarray(wave))
+        sand = Swept(halo(jnp.asarray(wave)), None)
         for _ in range(2):
-            u, _ = sweep(bed, Flow(jnp.asarray(rate), quantum(jnp.asarray(1.0))), Nothing(), u, None)
-        return float(np.abs(np.asarray(at(u))[4:12, 4:12]).max())
+            sand = sweep(bed, Flow(jnp.asarray(rate), quantum(jnp.asarray(1.0))), WholeCells(), sand)
+        return float(np.abs(np.asarray(at(sand.height))[4:12, 4:12]).max())
 
     assert growth(0.98 * limit) < 1 < growth(1.02 * limit)
     with pytest.raises(ValueError, match=r"scheme\.rate: .*unstable above"):

@@ -8,7 +8,7 @@ from PIL import Image
 
 import jaxsand as js
 from jaxsand.viz.loads import draw_bucket, save_bucket_animation
-from jaxsand.viz.side import outline_across, outline_along, section, side_figure, sides_figure
+from jaxsand.viz.side import Side, outline_across, outline_along, section, side_figure, sides_figure
 
 X, Y = np.meshgrid((np.arange(30) + 0.5) * 0.01, (np.arange(20) + 0.5) * 0.01)
 PLANE = 0.1 * X - 0.2 * Y + 0.01
@@ -84,7 +84,7 @@ def test_outlines_are_as_long_and_as_wide_as_the_tool_and_stand_on_their_lowest_
 
 def test_a_scene_without_a_tool_and_several_at_once():
     plain = js.make_scene((20, 30), 0.01)
-    figure = sides_figure([("one", plain, {"sand": PLANE}, PATH), ("$two$", BLADED, {"sand": PLANE}, PATH)])
+    figure = sides_figure([Side("one", plain, {"sand": PLANE}, PATH), Side("$two$", BLADED, {"sand": PLANE}, PATH)])
     assert [ax.get_title(loc="left") for ax in figure.axes[::2]] == ["one", "$two$"]
     assert "the tool's bottom" not in lines(figure.axes[0])
 

@@ -20,7 +20,7 @@ from jaxsand.planning.stroke_loss import Best, Evaluate
 
 
 @dataclass(frozen=True)
-class Found:
+class BestFound:
     """What a search found: the best plan [N, 4] (m), the calls it used, and every improvement on the way."""
 
     strokes: np.ndarray
@@ -28,7 +28,7 @@ class Found:
     history: list[Best]
 
 
-Search = Callable[[Evaluate, int, np.ndarray, int, int], Found]
+Search = Callable[[Evaluate, int, np.ndarray, int, int], BestFound]
 """`search(evaluate, n_strokes, bounds, budget, seed)`; `bounds` [2, 4] are the lowest and highest x0, y0, x1, y1 (m)."""
 
 
@@ -44,7 +44,7 @@ _ROUND = 1000  # calls in the first round of the greedy evolution
 _MOST = 2048  # calls a stroke in any of its rounds
 
 
-def random_shooting(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+def random_shooting(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> BestFound:
     """The best of plans whose strokes begin and end anywhere."""
     tally = _Tally(evaluate, n_strokes, bounds, budget)
     rng = np.random.default_rng(seed)
@@ -53,7 +53,7 @@ def random_shooting(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budg
     return tally.found()
 
 
-def greedy_evolution(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+def greedy_evolution(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> BestFound:
     """Stroke by stroke, each evolved on the map that the ones before it left; then all over again, with more calls.
 
     Rounds take 1,000 calls at first and then three times as many as all before, up to 2,048 a stroke, so that the best plan
@@ -67,7 +67,7 @@ def greedy_evolution(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, bud
     return tally.found()
 
 
-def cross_entropy(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+def cross_entropy(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> BestFound:
     """Draws plans from a Gaussian of 4 N independent numbers and moves it halfway to the best of them; again when narrow."""
     tally = _Tally(evaluate, n_strokes, bounds, budget)
     rng = np.random.default_rng(seed)
@@ -81,7 +81,7 @@ def cross_entropy(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget
     return tally.found()
 
 
-def cma_es(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> Found:
+def cma_es(evaluate: Evaluate, n_strokes: int, bounds: np.ndarray, budget: int, seed: int) -> BestFound:
     """CMA-ES as evosax has it, from the best of random plans; again with a larger population when it has converged.
 
     Source: arXiv:1604.00772. Needs the extra `rivals`: pip install 'jaxsand[rivals]'.
@@ -150,8 +150,8 @@ class _Tally:
         low, high = self.bounds
         return low + (1 - np.abs(1 - np.mod(units, 2))) * (high - low)
 
-    def found(self) -> Found:
-        return Found(self.history[-1].strokes, self.calls, self.history)
+    def found(self) -> BestFound:
+        return BestFound(self.history[-1].strokes, self.calls, self.history)
 
     def _improve(self, loss: float, strokes: np.ndarray) -> None:
         if not self.history or loss < self.history[-1].loss:

@@ -16,7 +16,7 @@ from jaxsand.planning.binary.astar import LARGEST, astar
 from jaxsand.planning.binary.board import Board, Cell, Problem, connected_pieces, make_problem
 from jaxsand.planning.binary.exact import exact
 from jaxsand.planning.binary.paper import ALPHA, paper
-from jaxsand.planning.binary.plans import Found, Plan, as_plan
+from jaxsand.planning.binary.plans import Plan, WalkFound, as_plan
 
 __all__ = ["Board", "Cell", "Engine", "Plan", "Problem", "connected_pieces", "make_problem", "plan"]
 
@@ -87,7 +87,7 @@ def plan(
     if engine == "exact":
         first = nearest_first(problem)
         if len(first) - 1 == simple:
-            return as_plan(problem, Found(first, simple, 0, 0), engine)
+            return as_plan(problem, WalkFound(first, simple, 0, 0), engine)
     match engine:
         case "paper":
             found = paper(problem, ALPHA / (weight or 1), int(bound or 2_000_000))
@@ -104,7 +104,7 @@ def plan(
     return as_plan(problem, replace(found, walk=walk, lower_bound=lower), engine)
 
 
-def _layered(problem: Problem, bound: int | None) -> Found:
+def _layered(problem: Problem, bound: int | None) -> WalkFound:
     """The engine "frontier", imported only when it is used."""
     from jaxsand.planning.binary.frontier import layered, two_colours
     from jaxsand.planning.binary.graph import MOST_CELLS, goal_only
@@ -116,7 +116,7 @@ def _layered(problem: Problem, bound: int | None) -> Found:
     found = layered(
         goal_only(dig, problem.board.cells[problem.starts[0]]), two_colours, limit=min(int(bound or 1 << 27), 1 << 27)
     )
-    return Found(list(found.walk) if found.walk else None, found.lower_bound, found.expanded, found.opened)
+    return WalkFound(list(found.walk) if found.walk else None, found.lower_bound, found.expanded, found.opened)
 
 
 def _check(problem: Problem, engine: str, weight: float | None, bound: int | None, seconds: float | None) -> None:

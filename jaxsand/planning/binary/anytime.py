@@ -9,7 +9,7 @@ from jaxsand.planning.binary.astar import LARGEST, astar
 from jaxsand.planning.binary.board import Board, Problem
 from jaxsand.planning.binary.exact import Blocks, exact
 from jaxsand.planning.binary.improve import improved
-from jaxsand.planning.binary.plans import Found, walk_cost
+from jaxsand.planning.binary.plans import WalkFound, walk_cost
 from jaxsand.planning.binary.sweepline import OutOfTime
 
 _WIDTHS = (0, 1000, 16_384, 262_144)
@@ -18,7 +18,7 @@ _LOOPY = 64  # cells of a block; smaller ones are proven before anything else pa
 _SPARE = 0.1  # of the time for making the first walk shorter
 
 
-def anytime(problem: Problem, seconds: float) -> Found:
+def anytime(problem: Problem, seconds: float) -> WalkFound:
     """Makes a greedy walk shorter, then searches wider and wider until a walk is proven best or the time is over.
 
     Where turns cost nothing the searches are sweeps with more and more states (exact.py); where they do, A* with lower and
@@ -38,13 +38,13 @@ def anytime(problem: Problem, seconds: float) -> Found:
     lower = float(simple_bound(problem))
     expanded = opened = 0
     blocks = Blocks(problem.board)
-    tries: list[Callable[[], Found]] = [partial(exact, problem, width, tick, blocks) for width in _WIDTHS]
+    tries: list[Callable[[], WalkFound]] = [partial(exact, problem, width, tick, blocks) for width in _WIDTHS]
     if problem.turn_cost:
         del tries[2:]
         if len(problem.board.cells) <= LARGEST:
             tries += [partial(astar, problem, 10**9, weight, tick) for weight in _WEIGHTS]
     elif len(problem.board.cells) <= LARGEST and any(len(block.cells) > _LOOPY for block in blocks.blocks):
-        tries.insert(1, lambda: Found(improved(problem, best, until(_SPARE)), 0, 0, 0))
+        tries.insert(1, lambda: WalkFound(improved(problem, best, until(_SPARE)), 0, 0, 0))
     for search in tries:
         if walk_cost(problem, best) <= lower:
             break
@@ -60,7 +60,7 @@ def anytime(problem: Problem, seconds: float) -> Found:
     if walk_cost(problem, best) > lower and blocks.known:
         with contextlib.suppress(OutOfTime):
             lower = max(lower, exact(problem, 0, until(1.2), blocks).lower_bound)
-    return Found(best, lower, max(expanded, blocks.states), opened)
+    return WalkFound(best, lower, max(expanded, blocks.states), opened)
 
 
 def simple_bound(problem: Problem) -> int:

@@ -9,14 +9,14 @@ from collections.abc import Callable
 
 from jaxsand.planning.binary.board import Problem
 from jaxsand.planning.binary.bound import block_bound
-from jaxsand.planning.binary.plans import Found, heading
+from jaxsand.planning.binary.plans import WalkFound, heading
 
 LARGEST = 3000
 """The most cells of a map for A*: its bound needs a table of the steps between any two."""
 _State = tuple[int, int, int]  # cell, cells left as bits, the cell before (-1 where turns cost nothing)
 
 
-def astar(problem: Problem, bound: int = 200_000, weight: float = 1.0, tick: Callable[[], None] = lambda: None) -> Found:
+def astar(problem: Problem, bound: int = 200_000, weight: float = 1.0, tick: Callable[[], None] = lambda: None) -> WalkFound:
     """The walk of least cost by A*: best first by f = g + weight h, with the admissible h of `block_bound`.
 
     Among equal f the deepest states come first, then an order by the cells left. A state that is reached by a shorter way is
@@ -52,9 +52,9 @@ def astar(problem: Problem, bound: int = 200_000, weight: float = 1.0, tick: Cal
             continue
         if not left and problem.end in (None, cell):
             lower = g if weight <= 1 else min(g, *(entry[-1] for entry in heap), math.inf)
-            return Found(_trace(parent, state), lower, expanded, opened)
+            return WalkFound(_trace(parent, state), lower, expanded, opened)
         if expanded == bound:
-            return Found(None, min(least, *(entry[-1] for entry in heap), math.inf), expanded, opened)
+            return WalkFound(None, min(least, *(entry[-1] for entry in heap), math.inf), expanded, opened)
         done[state] = g
         tick()
         expanded += 1

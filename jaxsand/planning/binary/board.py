@@ -133,7 +133,7 @@ def connected_pieces(dig: np.ndarray) -> list[set[Cell]]:
 
 
 @dataclass(frozen=True)
-class Block:
+class GraphBlock:
     """A block of the graph: a largest part that stays connected when any one cell is removed, or a bridge (two cells)."""
 
     cells: tuple[int, ...]
@@ -145,9 +145,9 @@ class Block:
         return len(self.edges) == 1
 
 
-def blocks_of(near: tuple[tuple[int, ...], ...]) -> list[Block]:
+def blocks_of(near: tuple[tuple[int, ...], ...]) -> list[GraphBlock]:
     """The blocks (2-connected components and bridges) of a connected graph; Hopcroft and Tarjan 1973, without recursion."""
-    found: list[Block] = []
+    found: list[GraphBlock] = []
     depth, low = [-1] * len(near), [0] * len(near)
     edges: list[tuple[int, int]] = []
     depth[0] = 0
@@ -171,7 +171,7 @@ def blocks_of(near: tuple[tuple[int, ...], ...]) -> list[Block]:
             if low[v] >= depth[parent]:
                 own = edges[cut:]
                 del edges[cut:]
-                found.append(Block(tuple(sorted({x for e in own for x in e})), tuple(own)))
+                found.append(GraphBlock(tuple(sorted({x for e in own for x in e})), tuple(own)))
     return found
 
 
@@ -185,12 +185,12 @@ class Hanging:
       below: for each cell with blocks below it, the cell and the places of these blocks in the list of `hang`.
     """
 
-    block: Block
+    block: GraphBlock
     gate: int
     below: tuple[tuple[int, tuple[int, ...]], ...]
 
 
-def hang(blocks: list[Block], root: int) -> list[Hanging]:
+def hang(blocks: list[GraphBlock], root: int) -> list[Hanging]:
     """The tree of blocks hung from a cell, children before parents."""
     of: dict[int, list[int]] = {}
     for b, block in enumerate(blocks):

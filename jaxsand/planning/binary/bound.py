@@ -22,9 +22,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
-from jaxsand.planning.binary.board import Block, Board, Hanging, blocks_of, hang
+from jaxsand.planning.binary.board import Board, GraphBlock, Hanging, blocks_of, hang
 
-Bound = Callable[[int, int], int]
+BlockBound = Callable[[int, int], int]
 _NEVER = -(10**9)
 
 
@@ -52,7 +52,7 @@ class _Part:
     rings: tuple[tuple[int, int], ...]
 
 
-def block_bound(board: Board, end: int | None = None) -> Bound:
+def block_bound(board: Board, end: int | None = None) -> BlockBound:
     """The bound as a function of the tool's cell and the cells left to dig (bits); with `end`, of walks that end there."""
     blocks = blocks_of(board.near)
     roots = max(16, 200_000 // len(board.cells))  # kept at a time: each takes as many bits as there are cells, squared
@@ -115,7 +115,7 @@ def _parts(board: Board, hung: list[Hanging], root: int) -> tuple[_Part, ...]:
     """The blocks hung from a root as `_Part`s, children before parents."""
     parts: list[_Part] = []
     for one in hung:
-        block: Block = one.block
+        block: GraphBlock = one.block
         own = sum(1 << v for v in block.cells if v != one.gate)
         below = tuple((1 << v, sum(parts[k].reach for k in children), children) for v, children in one.below)
         rings: dict[int, int] = {}

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from typing import TypeAlias
 
-from jaxsand.planning.binary.board import Block, Board, Hanging, Problem, blocks_of, hang
-from jaxsand.planning.binary.plans import Found
+from jaxsand.planning.binary.board import Board, GraphBlock, Hanging, Problem, blocks_of, hang
+from jaxsand.planning.binary.plans import WalkFound
 from jaxsand.planning.binary.relaxed import FAR, rest_of
-from jaxsand.planning.binary.sweepline import Ends, OutOfTime, Step, Sweep, Tour, steps_of
+from jaxsand.planning.binary.sweepline import LineStep, LineSweep, OutOfTime, Tour, WalkEnds, steps_of
 
 _Key = tuple[int, int, bool, int, tuple[tuple[int, int], ...]]
 
@@ -37,15 +37,15 @@ class Blocks:
     """
 
     board: Board
-    blocks: list[Block] = field(init=False)
-    sweeps: dict[int, list[Step]] = field(default_factory=dict)
+    blocks: list[GraphBlock] = field(init=False)
+    sweeps: dict[int, list[LineStep]] = field(default_factory=dict)
     known: dict[_Key, Tour] = field(default_factory=dict)
     states: int = 0
 
     def __post_init__(self) -> None:
         self.blocks = blocks_of(self.board.near)
 
-    def tour(self, block: Block, ends: Ends, width: int, tick: Callable[[], None]) -> Tour:
+    def tour(self, block: GraphBlock, ends: WalkEnds, width: int, tick: Callable[[], None]) -> Tour:
         """The cheapest walk over a block with these ends; uses what former calls proved. With a width of 0 only its lower
         bound.
         """
@@ -59,7 +59,7 @@ class Blocks:
         steps = self.sweeps[number]
         if not width and old:
             return Tour((), old.lower_bound, old.lower_bound, 0)
-        sweep = Sweep(block, steps, ends, rest_of(steps, ends, self.board.colour, tick))
+        sweep = LineSweep(block, steps, ends, rest_of(steps, ends, self.board.colour, tick))
         if not width:
             return Tour((), sweep.least, sweep.least, 0)
         try:
@@ -103,7 +103,7 @@ class _Saving:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Solved:
     """A block with all below it.
 
     Attributes:
@@ -120,7 +120,7 @@ class _Part:
     slack: int
 
 
-def exact(problem: Problem, width: int, tick: Callable[[], None] = lambda: None, blocks: Blocks | None = None) -> Found:
+def exact(problem: Problem, width: int, tick: Callable[[], None] = lambda: None, blocks: Blocks | None = None) -> WalkFound:
     """The shortest walk over a board, where turns cost nothing.
 
     Args:
@@ -143,7 +143,7 @@ def exact(problem: Problem, width: int, tick: Callable[[], None] = lambda: None,
         walk = min((w for w, _ in tries if w), key=len, default=None)
         lower = min(low for _, low in tries)
     states = blocks.states - before
-    return Found(walk, lower, states, states)
+    return WalkFound(walk, lower, states, states)
 
 
 def _hung_from(
@@ -154,7 +154,7 @@ def _hung_from(
     `ends` is 1 or 2: how many ends are free.
     """
     least = len(blocks.board.cells) - 1
-    parts: list[_Part] = []
+    parts: list[_Solved] = []
     hung = hang(blocks.blocks, root)
     try:
         for hanging in hung:
@@ -176,7 +176,7 @@ def _hung_from(
     return trail(times, root), lower
 
 
-def _at(cell: int, below: list[_Part], allowed: frozenset[int]) -> tuple[_Saving | None, _Saving | None]:
+def _at(cell: int, below: list[_Solved], allowed: frozenset[int]) -> tuple[_Saving | None, _Saving | None]:
     """What one end and both ends at a cell, or in the blocks below it, save at best."""
     singles = [_Saving(0)] if cell in allowed else []
     singles += [part.one for part in below if part.one]
@@ -191,12 +191,12 @@ def _best(savings: list[_Saving]) -> _Saving | None:
 def _part(
     blocks: Blocks,
     hanging: Hanging,
-    parts: list[_Part],
+    parts: list[_Solved],
     allowed: frozenset[int],
     count: int,
     width: int,
     tick: Callable[[], None],
-) -> _Part:
+) -> _Solved:
     """The figures of a block from those of the blocks below it."""
     block, gate = hanging.block, hanging.gate
     children = dict(hanging.below)
@@ -205,12 +205,12 @@ def _part(
     if block.bridge:
         one = next(iter(at.values()))[0]
         opened = _Saving(1 + one.value, (_Swap(block.edges, (1,)), one.swaps)) if one else None
-        return _Part(_Swap(block.edges, (2,)), 2, opened, _best(twos), 0)
+        return _Solved(_Swap(block.edges, (2,)), 2, opened, _best(twos), 0)
     gains = {v: one.value for v, (one, _) in at.items() if one}
-    closed = blocks.tour(block, Ends(gate, False, 0, {}), width, tick)
+    closed = blocks.tour(block, WalkEnds(gate, False, 0, {}), width, tick)
     slack = 0
 
-    def save(ends: Ends) -> _Saving:
+    def save(ends: WalkEnds) -> _Saving:
         nonlocal slack
         tour = blocks.tour(block, ends, width, tick)
         slack = max(slack, tour.cost - tour.lower_bound)
@@ -221,14 +221,14 @@ def _part(
             saving = _Saving(saving.value, (saving.swaps, below.swaps))
         return saving
 
-    opened = save(Ends(gate, True, 1, gains)) if gains else None
+    opened = save(WalkEnds(gate, True, 1, gains)) if gains else None
     if count == 2 and len(gains) > 1:
-        twos.append(save(Ends(gate, False, 2, gains)))
+        twos.append(save(WalkEnds(gate, False, 2, gains)))
     slack = max(slack, closed.cost - closed.lower_bound)
-    return _Part(_Swap(block.edges, closed.times), closed.cost, opened, _best(twos), slack)
+    return _Solved(_Swap(block.edges, closed.times), closed.cost, opened, _best(twos), slack)
 
 
-def _odd(block: Block, times: tuple[int, ...]) -> set[int]:
+def _odd(block: GraphBlock, times: tuple[int, ...]) -> set[int]:
     """The cells whose degree in a tour is odd."""
     odd: set[int] = set()
     for (a, b), often in zip(block.edges, times, strict=False):

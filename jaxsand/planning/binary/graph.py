@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
@@ -22,10 +21,10 @@ class Graph:
       start: the cell where the tool stands, which counts as dug.
     """
 
-    near: Any
-    goal: Any
-    odd: Any
-    start: Any
+    near: np.ndarray | jax.Array
+    goal: np.ndarray | jax.Array
+    odd: np.ndarray | jax.Array
+    start: np.integer | jax.Array
 
 
 def grid_near(walkable: np.ndarray) -> np.ndarray:

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxsand.planning.binary.board import Block, Cell
+from jaxsand.planning.binary.board import Cell, GraphBlock
 
 
-def sweep_order(block: Block, places: Sequence[Cell]) -> list[int]:
+def sweep_order(block: GraphBlock, places: Sequence[Cell]) -> list[int]:
     """An order of the block's cells with a small frontier (cells passed that still have neighbours to come).
 
     It is the best of sweeps along rows, columns and both diagonals, and of greedy growth from the far corners.

@@ -9,12 +9,12 @@ import heapq
 from fractions import Fraction
 
 from jaxsand.planning.binary.board import MOVES, Problem
-from jaxsand.planning.binary.plans import Found
+from jaxsand.planning.binary.plans import WalkFound
 
 ALPHA = 7.2
 
 
-def paper(problem: Problem, alpha: float = ALPHA, bound: int = 2_000_000) -> Found:
+def paper(problem: Problem, alpha: float = ALPHA, bound: int = 2_000_000) -> WalkFound:
     """The walk that the paper's A* finds; a lower `alpha` is greedier.
 
     At alpha 7.2 or above the walk is proven shortest: with a weight of at most 1, and as h changes by at most 1 in a step, f
@@ -54,7 +54,7 @@ def paper(problem: Problem, alpha: float = ALPHA, bound: int = 2_000_000) -> Fou
             while state in parent:
                 state = parent[state]
                 walk.append(back[state[0]])
-            return Found(walk[::-1], lower, expanded, 4 * expanded)
+            return WalkFound(walk[::-1], lower, expanded, 4 * expanded)
         if expanded == bound:
             break
         closed.add(state)
@@ -65,4 +65,4 @@ def paper(problem: Problem, alpha: float = ALPHA, bound: int = 2_000_000) -> Fou
                 cost[child], parent[child] = g + 1, state
                 count += 1
                 heapq.heappush(heap, (p * (g + 1) + q * (goal ^ child[1]).bit_count(), count, g + 1, *child))
-    return Found(None, lower, expanded, 4 * expanded)
+    return WalkFound(None, lower, expanded, 4 * expanded)

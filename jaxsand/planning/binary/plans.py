@@ -55,7 +55,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Found:
+class WalkFound:
     """What an engine found: a walk over the board's cells (None if it gave up), and what it proved."""
 
     walk: list[int] | None
@@ -64,7 +64,7 @@ class Found:
     opened: int
 
 
-def as_plan(problem: Problem, found: Found, engine: str) -> Plan:
+def as_plan(problem: Problem, found: WalkFound, engine: str) -> Plan:
     """The plan of a walk that an engine found."""
     assert found.walk is not None
     cells = tuple(problem.board.cells[i] for i in found.walk)

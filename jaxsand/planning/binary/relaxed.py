@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from jaxsand.planning.binary.sweepline import Ends, Step
+    from jaxsand.planning.binary.sweepline import LineStep, WalkEnds
 
 ALONE, EVEN, ODD = 0, 1, 2
 FAR = 1 << 28
@@ -73,14 +73,14 @@ class Degrees:
 Rest = Tables | Degrees
 
 
-def rest_of(steps: Sequence["Step"], ends: "Ends", colour: Sequence[int], tick: Callable[[], None]) -> Rest:
+def rest_of(steps: Sequence["LineStep"], ends: "WalkEnds", colour: Sequence[int], tick: Callable[[], None]) -> Rest:
     """The bound for a sweep: tables where they are small enough, else degrees."""
     live = [len(step.live) for step in steps]
     entries = sum(3**n for n in live) * (ends.count + 1) if max(live) <= _WIDEST else _ENTRIES + 1
     return _tables(steps, ends, tick) if entries <= _ENTRIES else _degrees(steps, ends, colour)
 
 
-def _tables(steps: Sequence["Step"], ends: "Ends", tick: Callable[[], None]) -> Tables:
+def _tables(steps: Sequence["LineStep"], ends: "WalkEnds", tick: Callable[[], None]) -> Tables:
     """The tables, from the last step backwards."""
     rest: np.ndarray = np.full(ends.count + 1, FAR, np.int32)
     rest[ends.count] = 0
@@ -112,7 +112,7 @@ def _tables(steps: Sequence["Step"], ends: "Ends", tick: Callable[[], None]) -> 
     return Tables([c.reshape(-1) for c in costs[::-1]])
 
 
-def _degrees(steps: Sequence["Step"], ends: "Ends", colour: Sequence[int]) -> Degrees:
+def _degrees(steps: Sequence["LineStep"], ends: "WalkEnds", colour: Sequence[int]) -> Degrees:
     cells: dict[int, int] = {}
     colours, gates = [np.zeros(0, int)], [np.zeros(0, bool)]
     for step in steps:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxsand.planning.binary.board import Block, Cell
+from jaxsand.planning.binary.board import Cell, GraphBlock
 from jaxsand.planning.binary.order import sweep_order
 from jaxsand.planning.binary.relaxed import ALONE, EVEN, FAR, ODD, Rest
 
@@ -31,7 +31,7 @@ class OutOfTime(Exception):  # noqa: N818 - not an error
 
 
 @dataclass(frozen=True)
-class Step:
+class LineStep:
     """One step of a sweep, which passes one cell.
 
     Attributes:
@@ -50,7 +50,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Ends:
+class WalkEnds:
     """Where a walk over a block may end.
 
     Attributes:
@@ -89,7 +89,7 @@ class Tour:
     states: int
 
 
-def steps_of(block: Block, places: Sequence[Cell]) -> list[Step]:
+def steps_of(block: GraphBlock, places: Sequence[Cell]) -> list[LineStep]:
     """The steps of a sweep over a block."""
     order = sweep_order(block, places)
     meets: dict[int, list[tuple[int, int]]] = {v: [] for v in block.cells}
@@ -112,7 +112,7 @@ def steps_of(block: Block, places: Sequence[Cell]) -> list[Step]:
         for s, u in leaving:
             del slot[u]
             free.append(s)
-        steps.append(Step(v, own, edges, leaving, tuple(sorted(slot.values()))))
+        steps.append(LineStep(v, own, edges, leaving, tuple(sorted(slot.values()))))
     return steps
 
 
@@ -148,12 +148,12 @@ class _States:
 
 
 @dataclass
-class Sweep:
+class LineSweep:
     """A block ready to be swept, for walks with given ends."""
 
-    block: Block
-    steps: list[Step]
-    ends: Ends
+    block: GraphBlock
+    steps: list[LineStep]
+    ends: WalkEnds
     rest: Rest
     least: int = field(init=False)
     proven: int = field(init=False)
@@ -255,7 +255,7 @@ class _Pass:
     next: int
 
 
-def _advance(state: _States, step: Step, ends: Ends, *, last: bool) -> _States:
+def _advance(state: _States, step: LineStep, ends: WalkEnds, *, last: bool) -> _States:
     """The states after one cell is passed in every possible way."""
     n = len(state.cost)
     state = replace(state, hang=state.hang.copy(), odd=state.odd.copy(), origin=np.arange(n), choice=np.zeros(n, np.uint8))
@@ -284,7 +284,7 @@ def _advance(state: _States, step: Step, ends: Ends, *, last: bool) -> _States:
     return state.take(np.flatnonzero(state.spent == ends.count)) if last else state
 
 
-def _leave(state: _States, slot: int, cell: int, ends: Ends, *, last: bool) -> _States:
+def _leave(state: _States, slot: int, cell: int, ends: WalkEnds, *, last: bool) -> _States:
     """The states after a cell has left the frontier, which needs a neighbour that it is connected with and an allowed
     degree.
     """

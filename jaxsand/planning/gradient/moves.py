@@ -5,7 +5,6 @@ A move takes plans with their losses, closest first, and returns plans that are 
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import numpy as np
@@ -52,7 +51,7 @@ def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 
     """Follows the gradient by Adam; its first step is `size` (m) long, its last a tenth of that, in heights less."""
     plans, losses = start.strokes.copy(), start.losses.copy()
     rule = optax.adam(optax.cosine_decay_schedule(size, max(steps, 1), 0.1), b2=0.95)
-    here: Any = plans.copy()
+    here = plans.copy()
     state, units = rule.init(here), _units(here)
     for _ in range(steps):
         if not account.afford(here):

@@ -100,8 +100,8 @@ def _starts(job: Job, at: np.ndarray, count: int) -> Places:
     rows, columns = np.floor(at[..., ::-1] / float(job.scene.grid.spacing)).astype(int).reshape(-1, 2).T
     surplus = np.pad(np.maximum(job.goal.off(job.height), 0).astype(float), half)
     window = 2 * half + 1
-    around = np.array([surplus[r : r + window, c : c + window].sum() for r, c in zip(rows, columns, strict=True)])
-    best = [i for i in np.argsort(-around, kind="stable")[:count] if around[i] > 0] or [0]
+    nearby = np.array([surplus[r : r + window, c : c + window].sum() for r, c in zip(rows, columns, strict=True)])
+    best = [i for i in np.argsort(-nearby, kind="stable")[:count] if nearby[i] > 0] or [0]
     return np.stack(np.unravel_index(best, at.shape[:2]), axis=1)
 
 
