@@ -103,25 +103,21 @@ def bench(
     if what == "sand":
         report["children"] = sand.children_per_second()
         report["sand"] = sand.bench_sand(tell, seed=seed)
-    if what == "ramp":
-        report |= ramps.bench_ramps(tell, seed=seed)
-    if what == "strokes":
-        report |= strokebench.bench_strokes(tell, **strokes)
     if what == "calibrate":
         report["calibrate"] = calibration.bench_calibrate(tell)
         report["calibrate_cone"] = calibration.bench_cone(tell)
     if what == "trench":
         report["trench_by_spacing"] = trenches.against_spacing(tell, grids + 1)
         report["trench_settles"] = trenches.settling(tell)
-    of_one_table = {
-        "env": lambda: envs.bench_env(batch, tell),
-        "stability": lambda: stability.stability(tell=tell),
-        "letters": lambda: bench_letters(tell),
+    others: dict[str, Callable[[], Row]] = {
+        "env": lambda: {"env": envs.bench_env(batch, tell)},
+        "stability": lambda: {"stability": stability.stability(tell=tell)},
+        "letters": lambda: {"letters": bench_letters(tell)},
+        "ramp": lambda: ramps.bench_ramps(tell, seed=seed),
         "tasks": lambda: tasks.bench_tasks(tell, seed=seed, **strokes),
+        "strokes": lambda: strokebench.bench_strokes(tell, **strokes),
     }
-    if what in of_one_table:
-        report[what] = of_one_table[what]()
-    return report
+    return report | others[what]() if what in others else report
 
 
 @dataclass(frozen=True)
@@ -215,7 +211,11 @@ def table(report: Row) -> str:
     """The report as text."""
     lines = [report["machine"], f"{report['batch']} maps of {_CELLS} x {_CELLS}, float32"]
     for what, rows in report.items():
-        if isinstance(rows, list) and rows and what not in ("map", "work_precision", "strokes_curves", "ramp_maps"):
+        if (
+            isinstance(rows, list)
+            and rows
+            and what not in ("map", "work_precision", "strokes_curves", "ramp_maps", "tasks_maps")
+        ):
             lines += ["", *as_table(rows, what.replace("_", " "))]
     return "\n".join(lines)
 

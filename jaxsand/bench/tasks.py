@@ -48,14 +48,18 @@ def bench_tasks(
     pushes: int = 500,
     strokes: int | None = None,
     seed: int = 0,
-) -> list[Row]:
-    """A row for each task and method, with means over the instances (the worst is `worst_mm`); see `figures`.
+) -> dict[str, list[Row]]:
+    """Each method on each task: means over the instances (the worst is `worst_mm`); see `figures`.
 
     Every method may use as many strokes as the task allows, but at most `strokes`, and simulate `pushes` pushes; a gradient
     counts as what it costs. The policy's strokes are as deep as the goal, and are not tried. `path_m` is the length of the
     strokes, and `moved` the volume (m^3) that they moved, summed over the strokes. `at_best_mm` is the mean
     |height - goal| of the map that is nearest by the goal's cost, of all that repose and volume allow, and
     `distance_at_best` (m) what no method's `distance` can be below (see `at_best`).
+
+    Returns:
+      The rows, as `tasks`; and as `tasks_maps` what the best method leaves of the first instance of each task, with its name
+      and key: lists [H, W] (m), to be drawn.
 
     Raises:
       ValueError: for a task or a method that does not exist.
@@ -64,17 +68,32 @@ def bench_tasks(
         for name in given:
             if name not in known:
                 raise ValueError(f"bench tasks: got {name!r}; give some of {', '.join(known)}")
-    rows = []
+    rows, maps = list[Row](), list[Row]()
     for name in names:
+        left = list[tuple[float, Row]]()
         for method in methods:
             tell(f"{name}: {method}")
             some = [_at_most(make_task(name, key), strokes) for key in range(seed, seed + instances)]
-            found = [_one(task, method, pushes, seed) for task in some]
+            found, after = zip(*(_one(task, method, pushes, seed) for task in some), strict=True)
             worst = {"worst_mm": max(one["mean_mm"] for one in found)}
             rows.append(
                 {"task": name, "method": method, **{key: _mean([one[key] for one in found]) for key in found[0]}, **worst}
             )
-    return rows
+            kept = np.round(after[0].astype(float), 6).tolist()
+            left.append((found[0]["distance"], {"task": name, "key": seed, "method": method, "after": kept}))
+        maps.append(min(left, key=lambda one: one[0])[1])
+    return {"tasks": rows, "tasks_maps": maps}
+
+
+def shown(maps: list[Row]) -> list[tuple[str, Task, np.ndarray]]:
+    """Of each task that `bench_tasks` keeps a map of: a title, the task, and the map [H, W] (m)."""
+    found = []
+    for one in maps:
+        task, after = make_task(one["task"], one["key"]), np.array(one["after"])
+        told = figures(task, after)
+        title = f"{one['task']}: {told['before_mm']:.2g} to {told['mean_mm']:.2g} mm, {one['method']}"
+        found.append((title, task, after))
+    return found
 
 
 def _mean(values: list[float | None]) -> float | None:
@@ -83,8 +102,8 @@ def _mean(values: list[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
-    """The figures of a method on an instance of a task."""
+def _one(task: Task, method: str, pushes: int, seed: int) -> tuple[Row, np.ndarray]:
+    """The figures of a method on an instance of a task, and the map [H, W] (m) that it leaves."""
     began = time.perf_counter()
     scene, plan, effort = _planned(task, method, pushes, seed)
     seconds = time.perf_counter() - began
@@ -92,7 +111,7 @@ def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
     maps = finish(scene, plan[None], 0, task.start[None])[:, 0]
     run = plan[:, plan.shape[1] // 2 :] - plan[:, : plan.shape[1] // 2]
     moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in pairwise(maps))
-    return {
+    row = {
         **figures(task, maps[-1]),
         "at_best_mm": figures(task, best.height)["mean_mm"],
         "distance_at_best": best.distance_bound,
@@ -100,8 +119,10 @@ def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
         "path_m": float(np.hypot(run[:, 0], run[:, 1]).sum()),
         "moved": moved * float(task.scene.grid.spacing) ** 2,
         "pushes": effort.cost,
+        "blade_mm": 1e3 * float(blade_of(scene).width),
         "seconds": seconds,
     }
+    return row, maps[-1]
 
 
 def _at_most(task: Task, strokes: int | None) -> Task:

@@ -46,6 +46,12 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
             with written(out / "bench-ramp.png") as path:
                 save_figure(lambda: sides_figure(ramps_shown(report["ramp_maps"])), path)
+        if "tasks_maps" in report:
+            from jaxsand.bench.tasks import shown as tasks_shown
+            from jaxsand.viz.gallery import gallery_figure
+
+            with written(out / "bench-tasks.png") as path:
+                save_figure(lambda: gallery_figure(tasks_shown(report["tasks_maps"])), path)
         if "strokes_curves" in report:
             from jaxsand.bench.strokes import REACHED, found
             from jaxsand.viz.strokes import found_figure, strokes_figure

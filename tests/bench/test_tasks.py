@@ -13,7 +13,7 @@ from jaxsand.goals.tasks import figures, make_task
 
 @pytest.mark.slow
 def test_rows_tell_what_methods_leave_and_spend():
-    rows = bench_tasks(names=("rectangle",), methods=METHODS, pushes=120)
+    rows = bench_tasks(names=("rectangle",), methods=METHODS, pushes=120)["tasks"]
     assert [row["method"] for row in rows] == [*METHODS]
     for row in rows:
         assert row["before_mm"] > row["mean_mm"] == row["worst_mm"] or row["method"] == "random"
@@ -27,7 +27,11 @@ def test_rows_tell_what_methods_leave_and_spend():
 
 def test_doing_nothing_is_told_as_that(monkeypatch):
     monkeypatch.setitem(tasks.RIVALS, "random", lambda *_: ((np.zeros((0, 6)), 0.0), tasks.Effort()))
-    (row,) = bench_tasks(names=("ring",), methods=("random",), instances=2)
+    found = bench_tasks(names=("ring",), methods=("random",), instances=2)
+    (row,) = found["tasks"]
+    ((title, task, after),) = tasks.shown(found["tasks_maps"])
+    np.testing.assert_array_equal(after, task.start)
+    assert title == f"ring: {figures(task, after)['mean_mm']:.2g} to {figures(task, after)['mean_mm']:.2g} mm, random"
     means = [figures(make_task("ring", key), make_task("ring", key).start)["mean_mm"] for key in (0, 1)]
     assert row["mean_mm"] == row["before_mm"] == pytest.approx(np.mean(means))
     assert row["worst_mm"] == pytest.approx(max(means))
@@ -38,7 +42,7 @@ def test_doing_nothing_is_told_as_that(monkeypatch):
 
 def test_of_vertical_walls_the_floor_is_told(monkeypatch):
     monkeypatch.setitem(tasks.RIVALS, "random", lambda *_: ((np.zeros((0, 6)), 0.0), tasks.Effort()))
-    (row,) = bench_tasks(names=("vertical",), methods=("random",), seed=1)  # 12 mm deep, walls of one cell
+    (row,) = bench_tasks(names=("vertical",), methods=("random",), seed=1)["tasks"]  # 12 mm deep, walls of one cell
     assert 0.2 * row["distance"] < row["distance_at_best"] < 0.3 * row["distance"]
     assert row["at_best_mm"] == pytest.approx(1.65, rel=0.02)
 
@@ -52,7 +56,9 @@ def test_names_that_do_not_exist_are_refused():
 
 def test_the_command_passes_its_options_on(monkeypatch, capsys):
     asked = []
-    monkeypatch.setattr(tasks, "bench_tasks", lambda tell, **given: asked.append(given) or [{"task": "pad", "mean_mm": 1.0}])
+    monkeypatch.setattr(
+        tasks, "bench_tasks", lambda tell, **given: asked.append(given) or {"tasks": [{"task": "pad", "mean_mm": 1.0}]}
+    )
     given = ["--goals", "pad,ramp", "--methods", "coverage", "--calls", "7", "--seeds", "2", "--seed", "3", "--strokes", "5"]
     assert main(["bench", "tasks", *given, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["tasks"] == [{"task": "pad", "mean_mm": 1.0}]
