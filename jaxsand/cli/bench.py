@@ -93,7 +93,8 @@ def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
     if options.what not in ("strokes", "tasks"):
         for option in ("goals", "calls", "seeds", "methods", "strokes"):
             if getattr(options, option) is not None:
-                raise ValueError(f"{option}: has an effect on bench strokes and bench tasks only; leave it out")
+                where = "bench tasks" if option == "strokes" else "bench strokes and bench tasks"
+                raise ValueError(f"{option}: has an effect on {where} only; leave it out")
         return {}
     methods = tuple(name.strip() for name in options.methods.split(",")) if options.methods else ()
     if options.what == "tasks":

@@ -101,6 +101,7 @@ _STROKES, _PUSHES = 24, 2000  # of a search for strokes that rise and sink, unle
 _REFINED = 4000  # pushes by --refine, unless told otherwise
 _RESOLUTION = 6  # grid cells to a block's side, unless told otherwise
 _SPACING = 0.01  # m, unless told otherwise
+_FAR = 1e4  # m: as large as a cell may be
 _DARK = 0.5  # of black: what a picture's free cells are darker than
 _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal that has heights
 
@@ -425,6 +426,8 @@ def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
     spacing = _SPACING if options.spacing is None else options.spacing
     resolution = options.resolution or _RESOLUTION
     scrapes = options.method in ("search", "optimise") and depth == 0
+    if spacing > _FAR:
+        raise ValueError(f"spacing: got {spacing}; give metres, at most {_FAR:g}")
     for field, value in (("spacing", spacing), *(() if scrapes else (("depth-mm", depth),))):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{field}: got {value}; give a positive number")

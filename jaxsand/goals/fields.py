@@ -6,6 +6,7 @@ radius: Annotated[float, LENGTH]
 import reprlib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
+from numbers import Real
 from typing import Any, Protocol, TypeVar, get_type_hints
 
 import numpy as np
@@ -73,7 +74,7 @@ class Number:
 
     def read(self, name: str, value: Any) -> float:
         """The number as a float."""
-        number = isinstance(value, int | float) and not isinstance(value, bool)
+        number = isinstance(value, Real) and not isinstance(value, bool)
         if not number or not self.low <= value <= self.high or (self.positive and value == self.low):
             raise wrong(name, value, self.what)
         return float(value)

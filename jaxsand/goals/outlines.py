@@ -62,7 +62,8 @@ def near(strokes: np.ndarray, reach: float, grid: Grid) -> Mask:
 def strip(ends: np.ndarray, width: float) -> np.ndarray:
     """The corners [4, 2] (m) of a rectangle `width` (m) wide between the middles [2, 2] of two of its sides."""
     run = ends[1] - ends[0]
-    side = np.array([-run[1], run[0]]) * (width / 2 / math.hypot(*run))
+    length = math.hypot(*run)
+    side = np.array([-run[1], run[0]]) * (width / 2 / length if length else 0.0)
     return np.array([ends[0] - side, ends[1] - side, ends[1] + side, ends[0] + side])
 
 

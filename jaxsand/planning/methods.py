@@ -16,7 +16,7 @@ from jaxsand.scene.progress import Tell
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Blade
 
-_WIDTHS = (0.5, 1.0, 2.0)  # of the blades to choose from, in those of the target's own
+_WIDTHS = (1.0, 0.5, 2.0)  # of the blades to choose from, in those of the target's own
 _THICKNESS = 1.5  # spacings
 
 
@@ -44,11 +44,11 @@ def searched(target: Target, before: np.ndarray | None, strokes: int, pushes: in
 
 
 def _blades(scene: Scene) -> tuple[Blade, ...]:
-    """Blades half as wide as the scene's, as wide, and twice as wide, but none wider than the map's shorter side."""
+    """Blades as wide as the scene's, half and twice as wide; none narrower than a cell, or wider than the shorter side."""
     blade, spacing = blade_of(scene), float(scene.grid.spacing)
-    most = max(float(blade.width), min(scene.grid.shape) * spacing)
-    widths = (times * float(blade.width) for times in _WIDTHS)
-    return tuple(Blade(width=width, thickness=_THICKNESS * spacing, depth=0.0) for width in widths if width <= most)
+    own, most = float(blade.width), min(scene.grid.shape) * spacing
+    widths = [own, *(times * own for times in _WIDTHS[1:] if spacing <= times * own <= most)]
+    return tuple(Blade(width=width, thickness=_THICKNESS * spacing, depth=0.0) for width in widths)
 
 
 def optimised(target: Target, before: np.ndarray | None, strokes: int | None, pushes: int, seed: int, tell: Tell) -> Target:

@@ -164,7 +164,9 @@ def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -
 def height_goal(goal: Goal | np.ndarray, kind: Kind, name: str, layout: Layout) -> Target:
     """A height map, or a `Goal`, as a goal that has no strokes yet; cells that are NaN are free."""
     shape = np.shape(goal.height if isinstance(goal, Goal) else goal)
-    scene = make_scene((shape[0], shape[1]), layout.spacing, tool=layout.blade)
+    most = layout.spacing * max(1, *shape[:2])  # a blade for larger maps is cut to this one
+    blade = replace(layout.blade, width=min(layout.blade.width, most), thickness=min(layout.blade.thickness, most))
+    scene = make_scene((shape[0], shape[1]), layout.spacing, tool=blade)
     wanted = as_goal(scene, goal)
     height = np.asarray(wanted.height)
     alike = wanted.power == 2 and all(np.array_equal(weight, ~wanted.free) for weight in (wanted.above, wanted.below))

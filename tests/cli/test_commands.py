@@ -120,6 +120,7 @@ BAD = {
     "negative spacing": (["shape", "S", "--spacing", "-1"], "spacing: got -1.0"),
     "depth of none": (["shape", "S", "--depth-mm", "0"], "depth-mm: got 0.0"),
     "resolution of none": (["shape", "S", "--resolution", "0"], "resolution: got '0'"),
+    "spacing beyond reason": (["shape", "dip.npy", "--spacing", "1e39"], r"spacing: got 1e\+39; give metres"),
     "resolution beyond reason": (["shape", "S", "--resolution", "9999"], "resolution: got 9999"),
     "goal without data": (
         ["shape", "holes.npy", "--method", "plan", "--no-data", "-9999"],

@@ -308,6 +308,7 @@ BAD = {
     ),
     "a book": (other("text", text="a" * 10**6, corner=[0, 0], size=1, width=1), r"shapes\[0\].text: got 'aaa"),
     "a shape beside the map": (changed(centre=[1, 1]), r"shapes\[0\]: covers no cell's centre on a map of 0.16 x 0.12 m"),
+    "a rectangle of no length": (other("rectangle", centre=[0.08, 0.06], size=[1e-300, 0.02]), r"shapes\[0\]: covers no"),
     "a shape between centres": (changed(centre=[0.08, 0.06], radius=0.002), r"shapes\[0\]: covers no cell"),
     "outside in other words": ({"shapes": [DISC], "outside": "level"}, 'outside: got \'level\'; give "free", "heaps"'),
     "outside of nan": ({"shapes": [DISC], "outside": {"height": math.nan}}, r"outside.height: got nan"),

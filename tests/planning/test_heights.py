@@ -196,5 +196,23 @@ def test_of_several_blades_the_one_that_suits_is_chosen():
     np.testing.assert_array_equal(replay(SCENE, LEVEL, found.paths), found.height)
     with pytest.raises(ValueError, match=r"tools: got a choice with Lattice\(\)"):
         js.plan_sand(SCENE, LEVEL, RAMP, tools=(narrow, wide))
-    with pytest.raises(ValueError, match="tools: got Wheel; give blades"):
-        js.plan_sand(SCENE, LEVEL, RAMP, actions=js.Rising(), tools=(js.Wheel(),))
+    for tools, message in {
+        (js.Wheel(),): r"tools\[0\]: got Wheel; give a Blade",
+        (wide, js.Blade(width=0.004, thickness=0.03)): r"tools\[1\]: tool.width: got 0.004 m, less than a cell",
+        narrow: "tools: got one Blade; give a list",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            js.plan_sand(SCENE, LEVEL, RAMP, actions=js.Rising(), tools=tools)
+
+
+def test_a_first_plan_is_kept_where_nothing_better_is_found():
+    job, stroke = Job(SCENE, LEVEL, WANTED, 1, js.Rising()), np.array([[0.1, 0.1, -0.01, 0.2, 0.1, 0.01]])
+    (path,), effort = search_heights(job, 1, np.random.default_rng(0), first=(stroke, 0.0))
+    np.testing.assert_array_equal(path.ravel(), stroke[0])
+    assert effort.cost <= 1
+
+
+def test_a_map_too_small_for_a_stroke_is_named():
+    scene = js.make_scene((1, 1), 0.02, tool=js.Blade(width=0.02, thickness=0.02))
+    with pytest.raises(ValueError, match=r"height: got \[1, 1\] cells, too few for a stroke of 2 spacings"):
+        js.plan_sand(scene, np.zeros((1, 1)), np.ones((1, 1)), actions=js.Rising())

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search.actions import Actions, Flat, Job, Lattice, Path, Rising, Steps, longest_stroke
 from jaxsand.planning.search.binary import binary_hints, binary_paths
+from jaxsand.planning.search.drafts import Ended, nothing
 from jaxsand.planning.search.heights import search_heights, with_the_best
 from jaxsand.planning.search.reach import blade_size, least_distance, volume_distance
 from jaxsand.planning.search.rollouts import Effort, distance, replay
@@ -21,7 +22,7 @@ from jaxsand.planning.search.strokes import search_strokes
 from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, as_array, blade_of, fit
-from jaxsand.scene.tools import Blade
+from jaxsand.scene.tools import Blade, square
 
 _CHOICE = 0.25  # of the budget is for first plans with each of several blades
 
@@ -120,7 +121,8 @@ def plan_sand(
         too few for what it does at each stroke, it tries fewer strokes, or none.
       seed: equal seeds give equal plans.
       tools: blades to choose from, with `Rising` or `Flat`; none leaves the scene's. A first plan is made with each, for a
-        quarter of the budget in all, and the one that leaves the sand closest to the goal makes the rest.
+        quarter of the budget in all, and the search goes on with the blade, and from the plan, that leaves the sand closest
+        to the goal; with the first blade where there is too little budget for that.
 
     Returns:
       A `SandPlan`; where nothing brings the sand closer to the goal it has no paths, and `reason` says why.
@@ -147,12 +149,15 @@ def plan_sand(
     height, wanted = _checked(scene, height), as_goal(scene, goal)
     _check_options(scene, actions, strokes, budget, seed)
     job, rng, effort = Job(scene, height, wanted, strokes, actions), np.random.default_rng(seed), Effort()
-    before, paths = float(distance(height, wanted)), list[Path]()
-    if before > 0 and tools:
-        job, effort = with_the_best(job, _blades(tools, actions), _CHOICE * budget, rng)
-        scene = job.scene
+    before, paths, first = float(distance(height, wanted)), list[Path](), nothing(job)
+    blades = _blades(scene, tools, actions) if isinstance(tools, Blade) or len(tools) else ()
+    if blades:
+        job = replace(job, scene=replace(scene, tool=blades[0]))
+    if before > 0 and len(blades) > 1:
+        job, first, effort = with_the_best(job, blades, _CHOICE * budget, rng)
+    scene = job.scene
     if before > 0:
-        paths, more = _search(job, int(budget - effort.cost), rng)
+        paths, more = _search(job, first, int(budget - effort.cost), rng)
         effort += more
     after = replay(scene, height, paths)
     left = float(distance(after, wanted))
@@ -162,29 +167,36 @@ def plan_sand(
         bound = max(volume_distance(scene, height, wanted), at_best(scene, height, wanted).distance_bound if before else 0.0)
     else:
         bound = least_distance(scene, height, wanted, strokes, longest_stroke(scene, actions))
-    estimate = min(left, max(0.0, before - strokes * effort.gain))
+    estimate = min(left, max(bound, before - strokes * effort.gain))
     reason = None if paths else why_no_strokes(scene, height, wanted)
     return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason, blade_of(scene))
 
 
-def _blades(tools: Sequence[Blade], actions: Actions) -> tuple[Blade, ...]:
-    """The blades to choose from; ValueError unless they are some that go with the actions."""
+def _blades(scene: Scene, tools: Sequence[Blade], actions: Actions) -> tuple[Blade, ...]:
+    """The blades to choose from; ValueError unless they are some that the scene might have, and go with the actions."""
+    if isinstance(tools, Blade):
+        raise ValueError("tools: got one Blade; give a list of blades, or none to use the scene's")
     if not isinstance(actions, Rising | Flat):
         raise ValueError(
             f"tools: got a choice with {type(actions).__name__}(); it goes with Rising() or Flat(), leave it out"
         )
-    for tool in tools:
+    for k, tool in enumerate(tools):
         if not isinstance(tool, Blade):
-            raise ValueError(f"tools: got {type(tool).__name__}; give blades")
+            raise ValueError(f"tools[{k}]: got {type(tool).__name__}; give a Blade")
+        try:
+            tool.check(scene.grid)
+            square(tool)
+        except ValueError as error:
+            raise ValueError(f"tools[{k}]: {error}") from None
     return tuple(tools)
 
 
-def _search(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
+def _search(job: Job, first: Ended, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
     if isinstance(job.actions, Steps):
         walks = binary_paths(job.scene, job.height, job.goal, job.actions)
         return search_steps(job, walks[0] if walks else np.zeros((0, 2), int), budget, rng)
     if isinstance(job.actions, Rising | Flat):
-        return search_heights(job, budget, rng)
+        return search_heights(job, budget, rng, first)
     return search_strokes(job, binary_hints(job), budget, rng)
 
 
@@ -217,6 +229,11 @@ def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, se
         for name in ("shortest", "longest", "lowest", "highest"):
             if not isinstance(getattr(actions, name), int | float):
                 raise ValueError(f"actions.{name}: got {getattr(actions, name)!r}; give a number")
+        if across < actions.shortest <= Rising.shortest:
+            raise ValueError(
+                f"height: got {list(scene.grid.shape)} cells, too few for a stroke of {actions.shortest:.4g} spacings; "
+                "give a larger map"
+            )
         if not 0 < actions.shortest <= min(actions.longest, across):
             raise ValueError(
                 f"actions.shortest: got {actions.shortest!r} with longest {actions.longest!r}; "

@@ -63,7 +63,8 @@ class Rising:
     A stroke has the heights of the tool's bottom at its start and at its end, in place of the blade's own depth.
 
     Args:
-      shortest: the shortest stroke that is proposed, in grid spacings; from a corner of the map it may be shorter.
+      shortest: the shortest stroke that is proposed, in grid spacings; at the map's edges, which cut it off, it may be
+        shorter.
       longest: the longest stroke that is made, in grid spacings.
       lowest: the least height that the tool's bottom may have (m).
       highest: the greatest height that it may have (m).
@@ -98,7 +99,8 @@ class Flat:
     With `lowest` equal to `highest`, all strokes are at that height.
 
     Args:
-      shortest: the shortest stroke that is proposed, in grid spacings; from a corner of the map it may be shorter.
+      shortest: the shortest stroke that is proposed, in grid spacings; at the map's edges, which cut it off, it may be
+        shorter.
       longest: the longest stroke that is made, in grid spacings.
       lowest: the least height that the tool's bottom may have (m).
       highest: the greatest height that it may have (m).

@@ -20,6 +20,11 @@ Ended = tuple[np.ndarray, float]
 """A plan [k, 6] (m) of at most as many strokes as the job allows, and how far from the goal it leaves the sand (m)."""
 
 
+def nothing(job: Job) -> Ended:
+    """No strokes."""
+    return np.zeros((0, 6)), float(distance(job.height, job.goal))
+
+
 def least_work(job: Job, budget: float) -> tuple[Ended, Effort]:
     """Strokes along the plan of least work, made anew on the sand that each leaves, and none of them tried before."""
     maps, plan, effort = [job.height], np.zeros((0, 6)), Effort()
@@ -42,7 +47,7 @@ def best_coverage(job: Job, budget: float) -> tuple[Ended, Effort]:
     The readings that are foreseen to leave the sand closest to the goal are pushed first.
     """
     plans = [within(job, coverage(job.scene, job.goal, job.height, reading)[: job.strokes]) for reading in READINGS]
-    best, effort = (np.zeros((0, 6)), float(distance(job.height, job.goal))), Effort()
+    best, effort = nothing(job), Effort()
     for plan in (plans[k] for k in np.argsort(_hoped(job, plans), kind="stable")):
         if effort.cost + len(plan) > budget:
             break

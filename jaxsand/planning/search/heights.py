@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxsand.planning.search.actions import Job, Path
-from jaxsand.planning.search.drafts import best_coverage, least_work, one_by_one, promising
+from jaxsand.planning.search.drafts import Ended, best_coverage, least_work, nothing, one_by_one, promising
 from jaxsand.planning.search.foresight import foreseen
 from jaxsand.planning.search.proposals import around, propose_heights
 from jaxsand.planning.search.rollouts import Effort, distance
@@ -23,9 +23,11 @@ _VARIANTS = 255  # of a stroke that are foreseen at a time
 _TRIED = 3  # of those are pushed
 
 
-def search_heights(job: Job, budget: float, rng: np.random.Generator) -> tuple[list[Path], Effort]:
-    """The best strokes with heights found for a job, at a cost of at most `budget` full pushes."""
-    plans, effort = list[tuple[np.ndarray, float]](), Effort()
+def search_heights(
+    job: Job, budget: float, rng: np.random.Generator, first: Ended | None = None
+) -> tuple[list[Path], Effort]:
+    """The best strokes with heights found for a job, at a cost of at most `budget` full pushes; `first` is known before."""
+    plans, effort = [nothing(job) if first is None else first], Effort()
     for draft, share in _SHARES:
         found, more = draft(job, share * budget)
         plans.append(found)
@@ -38,16 +40,19 @@ def search_heights(job: Job, budget: float, rng: np.random.Generator) -> tuple[l
     return [stroke.reshape(2, 3) for stroke in plan], effort + more
 
 
-def with_the_best(job: Job, tools: tuple[Blade, ...], budget: float, rng: np.random.Generator) -> tuple[Job, Effort]:
-    """The job with the blade whose first plan, one stroke after another, leaves the sand closest to the goal."""
-    best, least, effort = job, np.inf, Effort()
+def with_the_best(job: Job, tools: tuple[Blade, ...], budget: float, rng: np.random.Generator) -> tuple[Job, Ended, Effort]:
+    """The job with the blade whose first plan, one stroke after another, leaves the sand closest to the goal, and that plan.
+
+    It is the job as it was, and no plan, where the budget allows none.
+    """
+    best, first, effort = job, nothing(job), Effort()
     for tool in tools:
         with_it = replace(job, scene=replace(job.scene, tool=tool))
-        (_, left), more = one_by_one(with_it, budget / len(tools), rng)
+        plan, more = one_by_one(with_it, budget / len(tools), rng)
         effort += more
-        if left < least:
-            best, least = with_it, left
-    return best, effort
+        if plan[1] < first[1]:
+            best, first = with_it, plan
+    return best, first, effort
 
 
 def _varied(job: Job, plan: np.ndarray, budget: float, rng: np.random.Generator) -> tuple[np.ndarray, Effort]:
