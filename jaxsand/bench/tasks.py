@@ -22,6 +22,7 @@ from jaxsand.planning.search.strokes import finish
 from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, blade_of
+from jaxsand.scene.tools import Blade
 
 Method = Callable[[Job, float, np.random.Generator], earth.Found]
 
@@ -160,8 +161,8 @@ def _planned(task: Task, method: str, pushes: int, seed: int) -> tuple[Scene, np
 
 
 def _by_policy(task: Task) -> tuple[Scene, np.ndarray, Effort]:
-    """The shipped policy's strokes, by a blade as deep as the goal lies below height 0."""
-    depth = -min(0.0, float(np.nanmin(np.asarray(task.goal.height))))
-    scene = replace(task.scene, tool=replace(blade_of(task.scene), depth=depth))
+    """The shipped policy's strokes, by a blade as deep as the goal lies below height 0; of the usual depth if it does not."""
+    depth = -float(np.nanmin(np.asarray(task.goal.height)))
+    scene = replace(task.scene, tool=replace(blade_of(task.scene), depth=depth if depth > 0 else Blade().depth))
     found = plan_by_policy(load_policy(), sand_loss(scene, task.start, task.goal), task.strokes, Stages(0, 0), quiet)
     return scene, found.strokes, Effort(full=found.calls)
