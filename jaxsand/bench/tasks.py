@@ -161,7 +161,7 @@ def _planned(task: Task, method: str, pushes: int, seed: int) -> tuple[Scene, np
 
 
 def _by_policy(task: Task) -> tuple[Scene, np.ndarray, Effort]:
-    """The shipped policy's strokes, by a blade as deep as the goal lies below height 0; of the usual depth if it does not."""
+    """The shipped policy's strokes, by a blade as deep as the goal lies below height 0, or of the usual depth."""
     depth = -float(np.nanmin(np.asarray(task.goal.height)))
     scene = replace(task.scene, tool=replace(blade_of(task.scene), depth=depth if depth > 0 else Blade().depth))
     found = plan_by_policy(load_policy(), sand_loss(scene, task.start, task.goal), task.strokes, Stages(0, 0), quiet)
