@@ -16,7 +16,7 @@ from jaxsand.scene.progress import Tell
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Blade
 
-_WIDTHS = (1.0, 0.5, 2.0)  # of the blades to choose from, in those of the target's own
+_WIDTHS = (0.5, 2.0)  # of the blades to choose from beside the target's own, in that one's
 _THICKNESS = 1.5  # spacings
 
 
@@ -47,7 +47,7 @@ def _blades(scene: Scene) -> tuple[Blade, ...]:
     """Blades as wide as the scene's, half and twice as wide; none narrower than a cell, or wider than the shorter side."""
     blade, spacing = blade_of(scene), float(scene.grid.spacing)
     own, most = float(blade.width), min(scene.grid.shape) * spacing
-    widths = [own, *(times * own for times in _WIDTHS[1:] if spacing <= times * own <= most)]
+    widths = [own, *(times * own for times in _WIDTHS if spacing <= times * own <= most)]
     return tuple(Blade(width=width, thickness=_THICKNESS * spacing, depth=0.0) for width in widths)
 
 

@@ -150,7 +150,7 @@ def plan_sand(
     _check_options(scene, actions, strokes, budget, seed)
     job, rng, effort = Job(scene, height, wanted, strokes, actions), np.random.default_rng(seed), Effort()
     before, paths, first = float(distance(height, wanted)), list[Path](), nothing(job)
-    blades = _blades(scene, tools, actions) if isinstance(tools, Blade) or len(tools) else ()
+    blades = _blades(scene, tools, actions)
     if blades:
         job = replace(job, scene=replace(scene, tool=blades[0]))
     if before > 0 and len(blades) > 1:
@@ -176,7 +176,7 @@ def _blades(scene: Scene, tools: Sequence[Blade], actions: Actions) -> tuple[Bla
     """The blades to choose from; ValueError unless they are some that the scene might have, and go with the actions."""
     if isinstance(tools, Blade):
         raise ValueError("tools: got one Blade; give a list of blades, or none to use the scene's")
-    if not isinstance(actions, Rising | Flat):
+    if len(tools) and not isinstance(actions, Rising | Flat):
         raise ValueError(
             f"tools: got a choice with {type(actions).__name__}(); it goes with Rising() or Flat(), leave it out"
         )

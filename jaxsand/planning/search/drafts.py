@@ -64,8 +64,7 @@ def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[Ended
     Of many strokes those are tried that are foreseen to leave the sand closest to the goal. Where none of them brings it
     closer, others are tried in place of the next stroke.
     """
-    here, left = job.height, float(distance(job.height, job.goal))
-    plan, effort = np.zeros((0, 6)), Effort()
+    here, (plan, left), effort = job.height, nothing(job), Effort()
     for k in range(job.strokes):
         count = int((budget - effort.cost) / (job.strokes - k))
         if count < 1:

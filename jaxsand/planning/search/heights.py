@@ -73,9 +73,8 @@ def _varied(job: Job, plan: np.ndarray, budget: float, rng: np.random.Generator)
         if some < 1:
             break
         if k == count:
-            tried = np.repeat(np.concatenate([plan, plan[-1:]])[None] if count else np.zeros((1, 1, 6)), some, axis=0)
             new = promising(job, way[-1], some, rng)
-            tried, tried[: len(new), -1] = tried[: len(new)], new
+            tried = np.concatenate([np.repeat(plan[None], len(new), axis=0), new[:, None]], axis=1)
         else:
             tried = _hopeful(job, plan, k, way, some, rng)
         maps = finish(job.scene, tried, k, way[k][None])
