@@ -14,232 +14,7 @@ from PIL import Image
 from jaxsand.__main__ import main
 from jaxsand.goals.metrics import volume_error
 from jaxsand.planning.search.rollouts import Effort
-
-L_MAP = "#..\n#..\n###\n"
-PIT = {"kind": "rectangle", "centre": [0.12, 0.12], "size": [0.12, 0.08], "height": -0.004}
-SHEET = {"shape": [12, 12], "spacing": 0.02}
-DRAWINGS = {
-    "pit": {"shapes": [PIT], "grid": SHEET, "outside": "heaps"},
-    "pad": {"shapes": [PIT], "grid": SHEET, "outside": "free"},
-    "strict": {"shapes": [PIT], "grid": SHEET, "outside": {"above": 5}},
-    "plain": {"shapes": [PIT], "grid": SHEET},
-    "gridless": {"shapes": [PIT]},
-    "corners": {"shapes": [PIT, {"kind": "polygon", "points": [[0, 0], [0.1, 0.1]], "height": 0}], "grid": SHEET},
-    "huge": {"shapes": [PIT], "grid": {"shape": [100000, 100000], "spacing": 0.01}},
-    "infinite": {"shapes": [{**PIT, "height": float("nan")}], "grid": SHEET},
-}
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path.parent / "cache"))
-    (tmp_path / "l.txt").write_text(L_MAP)
-    (tmp_path / "empty.txt").write_text("")
-    (tmp_path / "level.txt").write_text("...\n...\n")
-    (tmp_path / "apart.txt").write_text("#.#\n")
-    (tmp_path / "ragged.txt").write_text("##\n#\n")
-    (tmp_path / "odd.txt").write_text("#x\n")
-    (tmp_path / "twostarts.txt").write_text("SS\n")
-    (tmp_path / "binary.txt").write_bytes(bytes(range(128, 256)))
-    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
-    (tmp_path / "broken.npy").write_bytes(b"rubbish")
-    (tmp_path / "a-file").write_text("")
-    (tmp_path / "land.xyz").write_text("0 0 0")
-    (tmp_path / "broken.json").write_text("{'shapes': ")
-    for name, drawing in DRAWINGS.items():
-        (tmp_path / f"{name}.json").write_text(json.dumps(drawing))
-    np.save(tmp_path / "cube.npy", np.zeros((2, 2, 2)))
-    np.save(tmp_path / "flat.npy", np.zeros((12, 12), np.float32))
-    np.save(tmp_path / "dip.npy", np.full((12, 12), -0.01))
-    np.save(tmp_path / "holes.npy", np.where(np.arange(12) == 8, -9999, np.zeros((12, 12), int)))
-    np.save(tmp_path / "nan.npy", np.full((12, 12), np.nan))
-    np.save(tmp_path / "small.npy", np.full((3, 3), -0.01))
-    np.save(tmp_path / "raw.npy", np.where(np.arange(144).reshape(12, 12) == 7, -9999, -0.01))
-    np.save(tmp_path / "words.npy", np.array([["a"]]))
-    np.save(tmp_path / "pile.npy", np.eye(12, dtype=np.float32) * 0.05)
-    Image.new("L", (30, 20), 255).save(tmp_path / "white.png")
-    return tmp_path
-
-
-BAD = {
-    "no command": ([], "arguments: "),
-    "unknown command": (["dig"], "COMMAND: invalid choice: 'dig'"),
-    "no goal": (["shape"], "arguments: .*goal"),
-    "unknown option": (["shape", "S", "--deep"], "arguments: unrecognized arguments: --deep"),
-    "unknown letter": (["shape", "é"], "letter: got 'é'"),
-    "unknown sign": (["shape", "?"], "letter: got '\\?'"),
-    "a word": (["shape", "SAND"], "goal: got 'SAND'.*--method strokes"),
-    "nothing": (["shape", " "], "goal: got an empty name"),
-    "missing map": (["shape", "none.txt"], "none.txt: no such file"),
-    "missing picture": (["shape", "none.png"], "none.png: no such file"),
-    "missing heights": (["shape", "none.npy"], "none.npy: no such file"),
-    "empty map": (["shape", "empty.txt"], "empty.txt: got no rows"),
-    "level map": (["shape", "level.txt"], "level.txt: got no cell to dig"),
-    "map in pieces": (["shape", "apart.txt"], "map: got 2 pieces"),
-    "ragged map": (["shape", "ragged.txt"], "ragged.txt: got 1 cells in row 2"),
-    "odd sign": (["shape", "odd.txt"], "odd.txt: got 'x' in row 1"),
-    "two starts": (["shape", "twostarts.txt"], "twostarts.txt: got 2 starts"),
-    "binary map": (["shape", "binary.txt"], "binary.txt: cannot be read as text"),
-    "broken picture": (["shape", "broken.png"], "broken.png: cannot be read as a picture"),
-    "white picture": (["shape", "white.png", "--method", "plan"], "goal: .*nothing to dig"),
-    "broken heights": (["shape", "broken.npy"], r"broken.npy: cannot be read as a \.npy"),
-    "cube of heights": (["shape", "cube.npy"], r"cube.npy: got shape \[2, 2, 2\]"),
-    "level heights": (["shape", "flat.npy", "--method", "plan"], "goal: .*nothing to dig"),
-    "heights not finite": (["shape", "nan.npy", "--method", "plan"], "goal: got 144 cells that are not finite"),
-    "too few heights": (["shape", "small.npy", "--method", "plan"], "goal: .*fewer than the 6"),
-    "missing drawing": (["shape", "none.json"], "none.json: no such file"),
-    "broken drawing": (["shape", "broken.json"], "broken.json: cannot be read as a drawing"),
-    "drawing of two corners": (["shape", "corners.json"], r"shapes\[1\]\.points: got 2 of them; give the corners"),
-    "drawing not finite": (["shape", "infinite.json", "--method", "search"], r"shapes\[0\]\.height: got nan; give metres"),
-    "drawing on a huge grid": (["shape", "huge.json"], r"grid\.shape\[0\]: got 100000; give"),
-    "drawing on no grid": (
-        ["shape", "gridless.json"],
-        r'grid: is missing in gridless.json; give {"shape": \[rows, columns\]',
-    ),
-    "drawing of two spacings": (["shape", "pit.json", "--spacing", "0.02"], "spacing: pit.json gives its own; leave"),
-    "drawing with no data": (["shape", "pit.json", "--no-data", "0"], r"no-data: has an effect on \.npy files only"),
-    "drawing with a start": (["shape", "pit.json", "--start", "1,1"], "start: pit.json is no map"),
-    "plan of a drawing that is free": (
-        ["shape", "pad.json", "--method", "plan"],
-        "method: 'plan' knows no free cells, and no weights",
-    ),
-    "plan of a drawing with weights": (
-        ["shape", "strict.json", "--method", "plan"],
-        "method: 'plan' knows no free cells, and no weights",
-    ),
-    "strokes of a drawing": (["shape", "pit.json", "--method", "strokes"], "method: 'strokes' pushes a glyph's own strokes"),
-    "start off the letter": (["shape", "S", "--start", "0,0"], r"start: got \(0, 0\)"),
-    "start of one number": (["shape", "S", "--start", "3"], "start: got '3'"),
-    "start for a picture": (["shape", "white.png", "--start", "1,1"], "start: .*leave --start out"),
-    "unknown method": (["shape", "S", "--method", "magic"], "method: invalid choice: 'magic'"),
-    "strokes of a map": (["shape", "l.txt", "--method", "strokes"], "method: 'strokes'"),
-    "start of strokes": (["shape", "S", "--method", "strokes", "--start", "3,3"], "start: has no effect on"),
-    "depth of strokes": (["shape", "S", "--method", "strokes", "--depth-mm", "9"], "depth-mm: has no effect on"),
-    "spacing of words": (["shape", "S", "--spacing", "fine"], "spacing: got 'fine'"),
-    "negative spacing": (["shape", "S", "--spacing", "-1"], "spacing: got -1.0"),
-    "depth of none": (["shape", "S", "--depth-mm", "0"], "depth-mm: got 0.0"),
-    "resolution of none": (["shape", "S", "--resolution", "0"], "resolution: got '0'"),
-    "spacing beyond reason": (["shape", "dip.npy", "--spacing", "1e39"], r"spacing: got 1e\+39; give metres"),
-    "resolution beyond reason": (["shape", "S", "--resolution", "9999"], "resolution: got 9999"),
-    "goal without data": (
-        ["shape", "holes.npy", "--method", "plan", "--no-data", "-9999"],
-        "goal: got 12 cells that are not finite; fill .*; or use --method search or optimise, to which they are free",
-    ),
-    "goal that is free": (["shape", "nan.npy", "--method", "search"], "goal: got NaN, free, in every cell"),
-    "free cells of a plan": (
-        ["shape", "dip.npy", "--method", "plan", "--free", "cube.npy"],
-        "free: has an effect with --method search, optimise",
-    ),
-    "free cells of a letter": (
-        ["shape", "S", "--method", "search", "--free", "cube.npy"],
-        r"free: has an effect on a goal in a \.npy file only",
-    ),
-    "free cells of another shape": (
-        ["shape", "dip.npy", "--method", "search", "--free", "cube.npy"],
-        r"free: got shape \[2, 2, 2\], the goal has \[12, 12\]",
-    ),
-    "free cells in words": (["shape", "dip.npy", "--method", "search", "--free", "words.npy"], "free: got dtype <U1"),
-    "free cells of nothing": (["shape", "dip.npy", "--method", "search", "--free", "none.npy"], "none.npy: no such file"),
-    "free cells of rubbish": (
-        ["shape", "dip.npy", "--method", "search", "--free", "broken.npy"],
-        r"free: broken.npy cannot be read as a \.npy array",
-    ),
-    "free cells in text": (
-        ["shape", "dip.npy", "--method", "search", "--free", "land.xyz"],
-        r"free: got 'land.xyz'; give a \.png \(dark is free\)",
-    ),
-    "surface without data": (
-        ["shape", "dip.npy", "--no-data", "-9999", "--surface", "holes.npy"],
-        "surface: got 12 cells that are not finite; fill",
-    ),
-    "no data of a letter": (["shape", "S", "--no-data", "-9999"], r"no-data: has an effect on \.npy files only"),
-    "no data of no scans": (["trench", "--no-data", "-9999"], "no-data: has an effect on --measured only"),
-    "elevations as text": (["shape", "land.asc"], r"goal: got 'land.asc', and \.asc is not read; .*\.npy.*first row"),
-    "elevations to push a text": (["shape", "land.tif", "--method", "strokes"], r"goal: got 'land.tif', and \.tif is not"),
-    "elevations of a file": (["shape", "land.xyz"], r"goal: got 'land.xyz', and \.xyz is not read"),
-    "elevations to settle": (
-        ["settle", "land.asc", "--out-file", "x.npy"],
-        r"land.asc: \.asc is not read; give a \.npy file.*numpy\.save.*flipud",
-    ),
-    "elevations as a surface": (["shape", "S", "--surface", "land.tif"], r"surface: got 'land.tif'; give .*\.npy file"),
-    "first row of a letter": (["shape", "S", "--first-row", "top"], r"first-row: has an effect on \.npy files only"),
-    "a value for no data as a goal": (
-        ["shape", "raw.npy"],
-        r"raw\.npy: got 1 cells more than 0\.12 m above or below level sand, such as -9999, .*--no-data -9999",
-    ),
-    "a value for no data to search": (["shape", "raw.npy", "--method", "search"], r"raw\.npy: got 1 cells more than"),
-    "a value for no data as a surface": (["shape", "dip.npy", "--surface", "raw.npy"], r"raw\.npy: got 1 cells more"),
-    "a value for no data to settle": (
-        ["settle", "raw.npy", "--out-file", "x.npy"],
-        r"raw\.npy: got 1 cells more than 1\.2 m above or below -0\.01 m, such as -9999, .*--no-data -9999",
-    ),
-    "unknown surface": (["shape", "S", "--surface", "moon"], "surface: got 'moon'"),
-    "surface of another size": (["shape", "S", "--surface", "flat.npy"], r"surface: got shape \[12, 12\]"),
-    "folder under a file": (["shape", "S", "--out", "a-file/x"], "out: cannot write to a-file/x"),
-    "no out file": (["settle", "pile.npy"], "arguments: .*--out-file"),
-    "out file of another kind": (["settle", "pile.npy", "--out-file", "x.txt"], "out-file: got x.txt"),
-    "no input": (["settle", "none.npy", "--out-file", "x.npy"], "none.npy: no such file"),
-    "words to settle": (["settle", "words.npy", "--out-file", "x.npy"], "words.npy: got dtype"),
-    "nan to settle": (
-        ["settle", "nan.npy", "--out-file", "x.npy"],
-        "nan.npy: got 144 cells that are not finite; .*--no-data nan",
-    ),
-    "right angle": (
-        ["settle", "pile.npy", "--out-file", "x.npy", "--repose-deg", "90"],
-        "repose-deg: got '90'; give degrees",
-    ),
-    "six neighbours": (["settle", "pile.npy", "--out-file", "x.npy", "--neighbours", "6"], "neighbours: invalid choice"),
-    "spacing zero": (["settle", "pile.npy", "--out-file", "x.npy", "--spacing", "0"], "spacing: got 0.0"),
-    "tolerance below zero": (["settle", "pile.npy", "--out-file", "x.npy", "--tol", "-1"], r"stop\.tolerance: got"),
-    "unwritable folder": (["settle", "pile.npy", "--out-file", "a-file/x.npy"], "out: cannot write to a-file"),
-    "plan of nothing": (["plan", "none.txt"], "none.txt: no such file"),
-    "plan in pieces": (["plan", "apart.txt"], "map: got 2 pieces"),
-    "search for a drawn goal": (["shape", "l.txt", "--method", "search"], "method: 'search' compares berms too"),
-    "pushes without a search": (
-        ["shape", "L", "--pushes", "9"],
-        "pushes: has an effect with --method search, optimise or policy only",
-    ),
-    "looking ahead without a policy": (
-        ["shape", "L", "--lookahead", "2"],
-        "lookahead: has an effect with --method policy only",
-    ),
-    "pushes of a policy alone": (
-        ["shape", "L", "--method", "policy", "--pushes", "9"],
-        "pushes: .*add that, or leave it out",
-    ),
-    "fewer pushes than the policy takes": (
-        ["shape", "L", "--method", "policy", "--refine", "--strokes", "3", "--pushes", "3"],
-        "pushes: got 3, and the policy may take 3 for 3 strokes before --refine; give more",
-    ),
-    "policy for a drawn goal": (["shape", "l.txt", "--method", "policy"], "method: 'policy' compares berms too"),
-    "plan to nowhere": (["plan", "l.txt", "--end", "0,2"], r"end: got \(0, 2\)"),
-    "plan to no cell": (["plan", "l.txt", "--end", "here"], "end: got 'here'"),
-    "plan in no time": (["plan", "l.txt", "--seconds", "0"], "seconds: got 0.0"),
-    "a seed below 0": (["shape", "L", "--method", "search", "--seed", "-1"], "seed: "),
-    "weight of nothing": (["plan", "l.txt", "--weight", "2"], "weight: has no effect with engine 'auto'"),
-    "turns beyond price": (["plan", "l.txt", "--turn-cost", "inf"], "turn_cost: got inf"),
-    "unknown benchmark": (["bench", "everything"], "what: invalid choice"),
-    "batch of none": (["bench", "settle", "--batch", "0"], "batch: got '0'"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_input_is_one_line_and_exit_code_2(here, capsys, name):
-    arguments, message = BAD[name]
-    before = sorted(here.iterdir())
-    try:
-        code = main(arguments)
-    except SystemExit as stop:
-        code = stop.code
-    out, err = capsys.readouterr()
-    assert code == 2
-    assert out == ""
-    assert err.count("\n") == 1
-    import re
-
-    assert re.match(f"error: {message}", err), err
-    assert sorted(here.iterdir()) == before
+from tests.cli.conftest import DRAWINGS, SHEET
 
 
 def run(*arguments, environment=None, **options):
@@ -377,10 +152,10 @@ def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypa
 @pytest.mark.parametrize("name", ["pit", "pad", "plain"])
 def test_methods_get_a_drawing_with_its_weights(here, name, method):
     from jaxsand.cli.parser import _parser
-    from jaxsand.cli.shape import _target
+    from jaxsand.cli.target import read_target
     from jaxsand.goals.drawing import read_drawing
 
-    target = _target(_parser().parse_args(["shape", f"{name}.json", "--method", method]))
+    target = read_target(_parser().parse_args(["shape", f"{name}.json", "--method", method]))
     assert (target.kind, target.name) == ("drawing", name)
     assert (target.scene.grid.shape, float(target.scene.grid.spacing)) == ((12, 12), 0.02)
     assert float(target.scene.tool.depth) == 0.004
@@ -397,9 +172,9 @@ def test_methods_get_a_drawing_with_its_weights(here, name, method):
 def test_a_drawing_is_planned(here, name):
     """Heaps may lie outside, as with every goal of the binary plan."""
     from jaxsand.cli.parser import _parser
-    from jaxsand.cli.shape import _target
+    from jaxsand.cli.target import read_target
 
-    target = _target(
+    target = read_target(
         _parser().parse_args(["shape", f"{name}.json", "--method", "plan", "--resolution", "3", "--depth-mm", "4"])
     )
     assert (target.kind, target.method, target.drawn, target.weighted) == ("drawing", "plan", True, None)
@@ -604,7 +379,7 @@ def test_cells_without_data_are_solid_to_settling(here, capsys):
 
 def test_the_first_row_lies_where_help_says(here, capsys):
     from jaxsand.cli.parser import _parser
-    from jaxsand.cli.shape import _target
+    from jaxsand.cli.target import read_target
 
     rows = np.zeros((24, 24))
     rows[:6] = -0.01
@@ -617,7 +392,7 @@ def test_the_first_row_lies_where_help_says(here, capsys):
         "first.npy --first-row top": True,
     }
     for arguments, expected in on_top.items():
-        target = _target(_parser().parse_args(["shape", *arguments.split()]))
+        target = read_target(_parser().parse_args(["shape", *arguments.split()]))
         middle = len(target.goal) // 2
         assert (target.goal[:middle].sum() > target.goal[middle:].sum()) == expected
         assert all((path[:, 1] > middle * 0.01).all() == expected for path in target.paths)
