@@ -74,6 +74,7 @@ if TYPE_CHECKING:
     from jaxsand.scene.boundaries import Draining as Draining
     from jaxsand.scene.boundaries import Open as Open
     from jaxsand.scene.boundaries import Walls as Walls
+    from jaxsand.scene.footprint import Pose as Pose
     from jaxsand.scene.grid import Grid as Grid
     from jaxsand.scene.material import DRY_SAND as DRY_SAND
     from jaxsand.scene.material import Material as Material
@@ -84,7 +85,6 @@ if TYPE_CHECKING:
     from jaxsand.scene.tools import Bucket as Bucket
     from jaxsand.scene.tools import Grousers as Grousers
     from jaxsand.scene.tools import NoTool as NoTool
-    from jaxsand.scene.tools import Pose as Pose
     from jaxsand.scene.tools import Smooth as Smooth
     from jaxsand.scene.tools import Tool as Tool
     from jaxsand.scene.tools import Wheel as Wheel
@@ -132,7 +132,7 @@ _HOMES = {
     "OutcomeError": "interaction.outcome",
     "Pairwise": "relaxation.schemes",
     "Plan": "planning.binary",
-    "Pose": "scene.tools",
+    "Pose": "scene.footprint",
     "PushRule": "interaction.rule",
     "Pushed": "interaction._path",
     "Relaxation": "relaxation.schemes",

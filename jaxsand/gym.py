@@ -1,4 +1,4 @@
-"""Gymnasium environments, registered when this is imported. The same as `jaxsand.envs.gymnasium`."""
+"""Gymnasium environments, registered when this is imported. The same as `jaxsand.envs.gymnasium`, with `picture`."""
 
 from jaxsand.envs.gymnasium import (
     EXCAVATE,
@@ -9,8 +9,8 @@ from jaxsand.envs.gymnasium import (
     MultiStrokeEnv,
     SandVectorEnv,
     SingleStrokeEnv,
-    picture,
 )
+from jaxsand.envs.picture import picture
 
 __all__ = [
     "EXCAVATE",

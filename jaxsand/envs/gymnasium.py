@@ -29,18 +29,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from jaxsand.envs import Box, Excavate, Heights, MultiStroke, OnMap, OnSand, make
+from jaxsand.envs import Box, Heights, MultiStroke, OnMap, OnSand, make
+from jaxsand.envs.picture import Core, Obs, picture
 from jaxsand.envs.weights import shown_weights
 from jaxsand.goals.goal import Goal
 
 SINGLE, MULTI = "jaxsand/SingleStroke-v0", "jaxsand/MultiStroke-v0"
 HEIGHTS, EXCAVATE = "jaxsand/MultiStrokeHeights-v0", "jaxsand/Excavate-v0"
-_LOW, _LEVEL, _HIGH, _TOOL = (np.array(c, float) for c in ((30, 60, 130), (222, 196, 150), (110, 60, 20), (200, 30, 30)))
-_PIXELS = 256  # along a panel of a picture, about
 _AT_HOME = os.getpid()  # the process that this module was imported in
-
-Obs = dict[str, Any]
-Core = OnMap | OnSand | MultiStroke | Excavate
 
 
 def _refuse_forks() -> None:
@@ -363,38 +359,6 @@ class SandVectorEnv(VectorEnv):
         return tuple(picture(self.core, {name: x[i] for name, x in self.shown.items()}) for i in range(self.num_envs))
 
 
-def picture(core: Core, shown: Obs) -> np.ndarray:
-    """Draws goal and sand side by side: blue is a blade's depth down, brown as far up, red where the tool stands.
-
-    Args:
-      core: the environment, as `jaxsand.make` gives it.
-      shown: its observation, as numpy arrays.
-
-    Returns:
-      [height, width, 3] (uint8).
-
-    Example:
-      >>> import numpy as np
-      >>> import jaxsand as js
-      >>> env, params = js.make("single-stroke")
-      >>> planes = {name: np.zeros((7, 7)) for name in ("goal", "current", "pose")}
-      >>> js.gym.picture(env, planes).shape
-      (252, 540, 3)
-    """
-    on_map = isinstance(core, OnMap)
-    panels = [_coloured(-shown[name] if on_map else shown[name]) for name in ("goal", "current")]
-    if "pose" in shown:
-        share = shown["pose"][..., None] * 0.7
-        panels[1] = panels[1] * (1 - share) + _TOOL * share
-    rows = panels[0].shape[0]
-    gap = np.full((rows, 1, 3), 255.0)
-    whole = np.concatenate([panels[0], gap, panels[1]], axis=1)
-    if not on_map:
-        whole = np.flipud(whole)
-    scale = max(1, _PIXELS // rows)
-    return np.repeat(np.repeat(whole, scale, 0), scale, 1).round().astype(np.uint8)
-
-
 def _reshaped(name: str, maps: Any, count: int, shape: tuple[int, ...]) -> np.ndarray:
     """Many maps, or stacks of maps, of a shape, in double precision; raises ValueError if they are not as many."""
     given = np.asarray(maps, float)
@@ -412,12 +376,6 @@ def _renders(mode: str | None) -> str | None:
     if mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode: got {mode!r}; give rgb_array or None")
     return mode
-
-
-def _coloured(height: np.ndarray) -> np.ndarray:
-    """Heights in units of the blade's depth as colours [H, W, 3]."""
-    part = np.clip(height, -1, 1)[..., None]
-    return _LEVEL + np.maximum(-part, 0) * (_LOW - _LEVEL) + np.maximum(part, 0) * (_HIGH - _LEVEL)
 
 
 def _spaces(core: Core, params: Any) -> tuple[spaces.Space[Any], spaces.Space[Any]]:

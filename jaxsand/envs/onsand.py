@@ -14,9 +14,9 @@ from jaxsand.goals import metrics
 from jaxsand.interaction.simulate import act
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.pipeline import Layout
+from jaxsand.scene.footprint import Pose, coverage
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, blade_of
-from jaxsand.scene.tools import Pose, coverage
 
 
 @jax.tree_util.register_dataclass

@@ -13,8 +13,8 @@ from jaxsand.interaction.resting import Sand, where_open
 from jaxsand.interaction.stencil import both_ends, inner, put, spread, window
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import ExactSum, at, halo, lose, nearest
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.grid import Neighbours
-from jaxsand.scene.tools import Pose
 
 SPARE = 1  # width of a block's margin in cells: if no sand moves in it, none would have moved beyond
 _CELLS = 8_192  # cells of all maps that are pushed together, whose sub-step then works in a core's cache

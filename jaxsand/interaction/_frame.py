@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.scene.tools import Pose
+from jaxsand.scene.footprint import Pose
 
 
 @jax.tree_util.register_dataclass

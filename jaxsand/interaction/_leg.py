@@ -17,8 +17,9 @@ from jaxsand.interaction._kept import Kept, Laid, lay, seen
 from jaxsand.interaction._path import State, over_the_map, turn_between
 from jaxsand.interaction.resting import no_flux
 from jaxsand.relaxation.flux import Fluxes
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade, Pose, reach
+from jaxsand.scene.tools import Blade, reach
 
 
 class Repeated(Step, Protocol):

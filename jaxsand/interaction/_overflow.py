@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxsand.interaction._displacement import Site
 from jaxsand.interaction._mound import Holds, distance
 from jaxsand.interaction._shade import between, inside, spot
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Pose
 
 
 @dataclass(frozen=True)

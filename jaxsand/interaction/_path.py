@@ -28,9 +28,10 @@ from jaxsand.relaxation.ghost_cells import (
 )
 from jaxsand.relaxation.stopping import Outcome, said
 from jaxsand.relaxation.sweep import Flow
+from jaxsand.scene.footprint import Pose, local
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade, NoTool, Pose, Wheel, extent, local, lowest, reach
+from jaxsand.scene.tools import Blade, NoTool, Wheel, extent, lowest, reach
 from jaxsand.scene.tools import usable as makes_sense
 from jaxsand.scene.window import Window
 

@@ -17,7 +17,7 @@ from jaxsand.interaction._wheel import Placed, Track
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import at, truncate
-from jaxsand.scene.tools import Pose
+from jaxsand.scene.footprint import Pose
 
 
 @jax.tree_util.register_dataclass

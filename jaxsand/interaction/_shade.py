@@ -6,8 +6,8 @@ import numpy as np
 from jax import lax
 
 from jaxsand.scene.boundaries import Walls
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Pose
 
 _BENDS = 2
 

@@ -1,6 +1,6 @@
 """A wheel in a block of sand: displacement from the cells that it newly covers, and links that it closes.
 
-Over each cell the wheel's rim stands at a height b of its own (tools.py); sand can lie below it. Where the wheel covers the
+Over each cell the wheel's rim stands at a height b of its own (`rim`); sand can lie below it. Where the wheel covers the
 share a of a cell, the cell's sand above b lies in the open share 1 - a. Sand that comes to lie above the rim as the wheel
 moves is displaced along the normal of the face that moves it, the rim or the leading flank; sand off the rim also moves
 towards the nearer flank. Sand under the wheel moves on, cell by cell, until there is room beside the wheel or below the rim.

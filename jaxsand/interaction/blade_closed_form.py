@@ -24,8 +24,9 @@ from jaxsand.interaction._slices import POINTS, WEIGHTS, hat, in_slices, of_slic
 from jaxsand.relaxation.ghost_cells import ExactSum, lose, total
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.boundaries import Walls
+from jaxsand.scene.footprint import Pose, coverage, local
 from jaxsand.scene.scene import Scene, deep
-from jaxsand.scene.tools import Blade, NoTool, Pose, coverage, local, square
+from jaxsand.scene.tools import Blade, NoTool, square
 from jaxsand.scene.window import Whole
 
 # Shapes, fitted to SteppedPush.fine() with blades of 2 to 16 cells; lengths are shares of the reach r, or cells.

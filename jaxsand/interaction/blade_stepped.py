@@ -35,8 +35,9 @@ from jaxsand.interaction._path import Pushed, Record, State, along_legs, heading
 from jaxsand.interaction._turning import BladeTurn
 from jaxsand.interaction.resting import bring_to_rest
 from jaxsand.relaxation.ghost_cells import ExactSum
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Blade, Number, Pose
+from jaxsand.scene.tools import Blade, Number
 from jaxsand.scene.validation import concrete
 from jaxsand.scene.window import AsNeeded, Window
 

@@ -24,8 +24,9 @@ from jaxsand.relaxation.ghost_cells import ExactSum
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
-from jaxsand.scene.tools import Blade, Bucket, Pose
+from jaxsand.scene.tools import Blade, Bucket
 from jaxsand.scene.window import Whole, Window
 
 

@@ -14,8 +14,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.relaxation.ghost_cells import mark
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Pose, Wheel
+from jaxsand.scene.tools import Wheel
 
 _ACROSS = 16
 

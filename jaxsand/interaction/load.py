@@ -20,10 +20,11 @@ from jaxsand.relaxation.schemes import SuperTimeStepping
 from jaxsand.relaxation.settling import run_off
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.boundaries import Base, Draining
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.grid import Grid
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, cast
-from jaxsand.scene.tools import Bucket, Pose
+from jaxsand.scene.tools import Bucket
 from jaxsand.scene.validation import concrete
 
 

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsand.interaction._path import heading
+from jaxsand.scene.footprint import local
 from jaxsand.scene.grid import Grid, centres
-from jaxsand.scene.tools import Number, local
+from jaxsand.scene.tools import Number
 
 _LEVEL = 1e-6  # the sine of an angle below which a way is parallel to an axis
 

@@ -15,10 +15,10 @@ from jaxsand.relaxation.ghost_cells import Bed, ExactSum, counted, largest, mark
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
+from jaxsand.scene.footprint import interval, local
 from jaxsand.scene.grid import centres
 from jaxsand.scene.masked import POINTS
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
-from jaxsand.scene.tools import interval, local
 from jaxsand.scene.validation import concrete, short
 
 _ROUNDS = 32  # in each of which the cells that are emptied are found; on the usual footprints two or three suffice

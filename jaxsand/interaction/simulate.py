@@ -20,9 +20,9 @@ from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.masked import POINTS
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
-from jaxsand.scene.tools import Pose
 from jaxsand.scene.window import Whole, Window
 
 Rules = tuple[PushRule, Scheme, Stop]

@@ -6,7 +6,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import heading
-from jaxsand.scene.tools import Pose
+from jaxsand.scene.footprint import Pose
 
 
 def cut(path: Float[Array, "n k"], count: int) -> Float[Array, "m k"]:

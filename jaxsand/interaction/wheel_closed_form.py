@@ -23,8 +23,9 @@ from jaxsand.interaction._displacement import Site, whole
 from jaxsand.interaction._path import Pushed, Record, State, along_legs, corners, over_the_map
 from jaxsand.interaction._slices import hat, wedge
 from jaxsand.interaction.blade_closed_form import ROOM, complete, typical_drop
+from jaxsand.scene.footprint import Pose, local
 from jaxsand.scene.scene import Scene, deep
-from jaxsand.scene.tools import Grousers, NoTool, Pose, Wheel, carried_area, half_chord, local, reach
+from jaxsand.scene.tools import Grousers, NoTool, Wheel, carried_area, half_chord, reach
 from jaxsand.scene.window import Whole
 
 _SAMPLES = 8  # of the cut, along each side of a cell

@@ -32,8 +32,9 @@ from jaxsand.interaction._rolling import Roll, Touchdown, WheelTurn
 from jaxsand.interaction._wheel import Track
 from jaxsand.interaction.ground import Ground, ground_of
 from jaxsand.relaxation.stopping import Outcome
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene
-from jaxsand.scene.tools import Pose, Smooth, Wheel, carried_area, half_chord, sunk
+from jaxsand.scene.tools import Smooth, Wheel, carried_area, half_chord, sunk
 from jaxsand.scene.window import Window
 
 if TYPE_CHECKING:

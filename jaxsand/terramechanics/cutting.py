@@ -18,10 +18,11 @@ import numpy as np
 from jax import lax
 
 from jaxsand.scene.boundaries import Base
+from jaxsand.scene.footprint import Pose, coverage
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, cast, fit
 from jaxsand.scene.soil import TINY, Scalar, Soil, check_number, check_soil
-from jaxsand.scene.tools import Blade, Pose, coverage, square
+from jaxsand.scene.tools import Blade, square
 from jaxsand.scene.validation import concrete
 
 

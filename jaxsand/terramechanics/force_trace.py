@@ -24,9 +24,10 @@ from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.stopping import Stop, check_whole
 from jaxsand.scene.bearing import wheel_force
 from jaxsand.scene.boundaries import Base
+from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene, cast, check_scene, fit
 from jaxsand.scene.soil import WONG_DRY_SAND, Soil, check_soil
-from jaxsand.scene.tools import Blade, Bucket, Pose, Wheel, slip_of, soil_of, square, sunk
+from jaxsand.scene.tools import Blade, Bucket, Wheel, slip_of, soil_of, square, sunk
 from jaxsand.terramechanics.cutting import cut_ahead, cut_force
 
 Felt = tuple[jax.Array, jax.Array, jax.Array]  # force (N) and moment (N m), [3] each, and work for each metre (N)

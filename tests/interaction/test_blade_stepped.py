@@ -9,8 +9,8 @@ import pytest
 
 import jaxsand as js
 from jaxsand.goals.metrics import volume_error
+from jaxsand.scene.footprint import coverage
 from jaxsand.scene.grid import centres
-from jaxsand.scene.tools import coverage
 
 from ..conftest import ANGLE, MU, turned
 

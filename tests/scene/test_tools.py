@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.scene.tools import Pose, local, usable
+from jaxsand.scene.footprint import Pose, local
+from jaxsand.scene.tools import usable
 
 
 def test_across_a_tool_counts_to_its_left():
