@@ -27,10 +27,9 @@ from jaxsand.bench.timing import race
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.planning.stroke_loss import GRADIENT, sand_loss
 from jaxsand.relaxation.stopping import Stop, Sweeps, UntilStill
-from jaxsand.scene.boundaries import Base
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import cast, make_scene
-from jaxsand.scene.tools import Blade, Bucket, Wheel
+from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Window
 
 STOPS: tuple[Stop, ...] = (*(UntilStill(t) for t in (0.1, 0.03, 0.01, 1e-3, 1e-4)), *(Sweeps(n) for n in (16, 64, 256)))
@@ -41,17 +40,6 @@ CASES = (
     *(GradientCase(pushes, window=Window((16, 16))) for pushes in (False, True)),
     GradientCase(False, stop=Sweeps(1000)),
 )
-TOOLS = (
-    GradientCase(True),
-    GradientCase(True, rises=True),
-    GradientCase(True, tool=Blade(yaw=0.5)),
-    GradientCase(True, tool=Blade(plates=0.03)),
-    GradientCase(True, tool=Wheel(0.04, 0.03, 0.01)),
-    GradientCase(True, tool=Wheel(0.04, 0.03, 0.01), rises=True),
-    GradientCase(True, tool=Bucket(0.04, 0.04, 4e-4), rises=True),
-    GradientCase(True, tool=Blade(depth=0.015), base=Base(-0.01)),
-)
-"""Each tool, and what it can do; blades and wheels at one height, and rising or sinking."""
 
 
 def bench_grad(
@@ -63,9 +51,8 @@ def bench_grad(
     cells: int = 32,
     batch: int = 64,
     rounds: int = _ROUNDS,
-    tools: tuple[GradientCase, ...] = TOOLS,
 ) -> dict[str, list[Row]]:
-    """Costs, errors (of every tool too), errors against run time when settling stops early, and what strokeloss.GRADIENT
+    """Costs, errors, errors against run time when settling stops early, and what strokeloss.GRADIENT
     stands for, on `batch` maps of `cells` a side. With `larger`, costs also on so many of these, and on a 64th as many of
     160 x 160."""
     sizes = ((cells, batch),) + (((cells, larger), (160, max(1, larger // 64))) if larger else ())
@@ -75,7 +62,6 @@ def bench_grad(
         "gradient_of_plans": multiples(tell, plans, cells=cells, rounds=rounds),
         "gradient_stopped_early": stopped_early(tell, early, stops, cells, batch, rounds),
         "gradient_error": accuracy(tell, cases, batch, cells),
-        "gradient_of_tools": accuracy(tell, tools, batch, min(cells, 24)),
     }
 
 

@@ -30,6 +30,7 @@ from jaxsand.bench import (
     sand,
     stability,
     tasks,
+    tools,
     trenches,
     work_precision,
 )
@@ -61,16 +62,16 @@ def bench(
     tell: Tell = quiet,
     grids: int = 3,
     seed: int = 0,
-    **strokes: Any,
+    **options: Any,
 ) -> Row:
     """The figures for `what`: settle, push, plan, or all of these; env, grad, calibrate, sand, strokes, trench,
-    stability, letters, ramp, or tasks.
+    stability, letters, ramp, tasks, or tools.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
-    `batch` is 4096, for env 1024, for grad 64, unless given. `strokes` are options of `strokebench.bench_strokes`, or of
-    `tasks.bench_tasks`.
+    `batch` is 4096, for env 1024, for grad 64, for tools 16, unless given. `options` are those of
+    `strokebench.bench_strokes`, of `tasks.bench_tasks`, or of `tools.bench_tools`.
     """
-    larger, batch = batch, batch or {"grad": 64, "env": 1024}.get(what, 4096)
+    larger, batch = batch, batch or {"grad": 64, "env": 1024, "tools": 16}.get(what, 4096)
     report: Row = {"machine": _machine(), "batch": batch, "map": [_CELLS, _CELLS]}
     if what in ("settle", "all"):
         report["settle"] = bench_settle(batch, tell)
@@ -114,8 +115,9 @@ def bench(
         "stability": lambda: {"stability": stability.stability(tell=tell)},
         "letters": lambda: {"letters": bench_letters(tell)},
         "ramp": lambda: ramps.bench_ramps(tell, seed=seed),
-        "tasks": lambda: tasks.bench_tasks(tell, seed=seed, **strokes),
-        "strokes": lambda: strokebench.bench_strokes(tell, **strokes),
+        "tasks": lambda: tasks.bench_tasks(tell, seed=seed, **options),
+        "tools": lambda: tools.bench_tools(tell, batch=batch, **options),
+        "strokes": lambda: strokebench.bench_strokes(tell, **options),
     }
     return report | others[what]() if what in others else report
 

@@ -21,9 +21,9 @@ def run_benchmark(options: argparse.Namespace) -> None:
         _device_for_each_core()
     from jaxsand.bench.report import bench, table
 
-    strokes = _of_strokes(options)
+    own = _own(options)
     origin = {"command": options.command_line, "commit": _commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
-    report = origin | bench(options.what, options.batch, tell, options.grids, options.seed, **strokes)
+    report = origin | bench(options.what, options.batch, tell, options.grids, options.seed, **own)
     if out:
         from jaxsand.viz.render import alpha_figure, complexity_figure, save_figure, work_precision_figure
 
@@ -58,7 +58,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
 
             with written(out / "bench-strokes.png") as path:
                 save_figure(lambda: strokes_figure(report["strokes_curves"], REACHED), path)
-            shown = found(strokes["goals"], report["strokes_curves"])
+            shown = found(own["goals"], report["strokes_curves"])
             if shown:
                 with written(out / "bench-strokes-found.png") as path:
                     save_figure(lambda: found_figure(shown), path)
@@ -88,13 +88,24 @@ def _device_for_each_core() -> None:
         jax.config.update("jax_num_cpu_devices", processors())
 
 
-def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
-    """The options of `bench strokes` and of `bench tasks`, of which other benches have none."""
+_WHERE = {
+    "goals": ("strokes", "tasks"),
+    "calls": ("strokes", "tasks"),
+    "seeds": ("strokes", "tasks"),
+    "methods": ("strokes", "tasks"),
+    "strokes": ("tasks",),
+    "points": ("tools",),
+}
+
+
+def _own(options: argparse.Namespace) -> dict[str, Any]:
+    """The options that only some benches have."""
+    for option, where in _WHERE.items():
+        if getattr(options, option) is not None and options.what not in where:
+            raise ValueError(f"{option}: has an effect on {' and '.join(f'bench {w}' for w in where)} only; leave it out")
+    if options.what == "tools":
+        return {"points": options.points} if options.points else {}
     if options.what not in ("strokes", "tasks"):
-        for option in ("goals", "calls", "seeds", "methods", "strokes"):
-            if getattr(options, option) is not None:
-                where = "bench tasks" if option == "strokes" else "bench strokes and bench tasks"
-                raise ValueError(f"{option}: has an effect on {where} only; leave it out")
         return {}
     methods = tuple(name.strip() for name in options.methods.split(",")) if options.methods else ()
     if options.what == "tasks":
@@ -107,8 +118,6 @@ def _of_strokes(options: argparse.Namespace) -> dict[str, Any]:
             "strokes": options.strokes,
         }
         return {name: value for name, value in given.items() if value}
-    if options.strokes is not None:
-        raise ValueError("strokes: has an effect on bench tasks only; leave it out")
     if options.goals not in (None, *_STROKE_GOALS):
         raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(_STROKE_GOALS)}")
     return {

@@ -159,11 +159,15 @@ def _bench(commands: Any) -> None:
             "letters",
             "ramp",
             "tasks",
+            "tools",
         ],
         default="all",
     )
     p.add_argument(
-        "--batch", type=count, metavar="N", help="maps in a batch (4096; env: 1024; grad: 64, if given larger maps as well)"
+        "--batch",
+        type=count,
+        metavar="N",
+        help="maps in a batch (4096; env: 1024; grad: 64, if given larger maps as well; tools: 16)",
     )
     p.add_argument("--grids", type=int, choices=range(4), default=3, help="grids for error against run time; 0: none (3)")
     p.add_argument("--seed", type=seed, default=0, metavar="K", help="of the searches on sand, the first for strokes (0)")
@@ -175,6 +179,7 @@ def _bench(commands: Any) -> None:
         "--goals", metavar="A,B", help="strokes: letters, turned, rough, or eight (letters); tasks: by name (all)"
     )
     p.add_argument("--methods", metavar="A,B", help="strokes, tasks: methods by name (all)")
+    p.add_argument("--points", type=count, metavar="N", help="tools: smooth points a tool to check gradients at (64)")
     p.add_argument("--strokes", type=count, metavar="N", help="tasks: at most so many strokes (each task's own number)")
     p.add_argument(
         "--out", type=path_name, metavar="DIR", help="folder for the report and its figure; strokes goes on there"

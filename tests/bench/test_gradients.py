@@ -43,13 +43,12 @@ def test_the_figures_make_sense(report):
 @pytest.mark.slow
 def test_the_whole_bench():
     stops = (UntilStill(0.1), Sweeps(16))
-    report = gradbench.bench_grad(print, None, SMALL, stops, (2,), 12, 4, 1, SMALL)
+    report = gradbench.bench_grad(print, None, SMALL, stops, (2,), 12, 4, 1)
     assert list(report) == [
         "gradient_cost",
         "gradient_of_plans",
         "gradient_stopped_early",
         "gradient_error",
-        "gradient_of_tools",
     ]
     check_numbers(report)
     assert [row["stop"] for row in report["gradient_stopped_early"]] == ["tolerance 0.1", "16 sweeps"]

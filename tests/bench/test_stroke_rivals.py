@@ -174,7 +174,8 @@ def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch)
     for line, message in {
         "strokes --methods shooting": "methods: got 'shooting'; give some of random shooting",
         f"strokes --out {tmp_path}": "out: line 1 of ",
-        "grad --calls 50": "calls: has an effect on bench strokes only; leave it out",
+        "grad --calls 50": "calls: has an effect on bench strokes and bench tasks only; leave it out",
+        "push --points 9": "points: has an effect on bench tools only; leave it out",
     }.items():
         assert main(["bench", *line.split()]) == 2
         assert message in capsys.readouterr().err
