@@ -16,6 +16,7 @@ from jaxsand.goals import metrics
 from jaxsand.goals.goal import Goal
 from jaxsand.goals.letters import stroke_list
 from jaxsand.goals.surfaces import rested, rough_surface
+from jaxsand.relaxation.settling import check_at_rest
 from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene, blade_of
 
@@ -160,6 +161,7 @@ def surfaces(scene: Scene, starts: Starts, count: int, rng: np.random.Generator)
             )
         for start in maps.reshape(-1, *maps.shape[-2:]):
             metrics.fits(scene, start, "starts")
+            check_at_rest(scene, start.astype(np.float32), "starts")
         return np.broadcast_to(maps.astype(np.float32), shape)
     if not isinstance(starts, Level | Rough):
         raise ValueError(f"starts: got {starts!r}; give Level(), Rough(), or maps of sand at rest")

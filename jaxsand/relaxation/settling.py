@@ -195,6 +195,13 @@ def steepest_slope(scene: Scene, height: Float[ArrayLike, "H W"]) -> Float[Array
     return _steepest(*fit(scene, height))
 
 
+def check_at_rest(scene: Scene, height: Float[ArrayLike, "H W"], name: str = "height") -> None:
+    """Raises ValueError, which names the map, if a slope of it is steeper than repose by more than 2e-3 (a tangent)."""
+    slope, repose = float(steepest_slope(scene, height)), float(jnp.tan(jnp.max(scene.material.repose_angle)))
+    if slope > repose + 2e-3:
+        raise ValueError(f"{name}: got a slope of {slope:.3g}, steeper than repose ({repose:.3g}); settle it first")
+
+
 @jax.jit
 def _steepest(scene: Scene, height: jax.Array) -> jax.Array:
     return steepest(prepare(scene), halo(mark(scene, height)[0]))

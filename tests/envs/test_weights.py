@@ -120,7 +120,7 @@ def test_a_map_is_a_goal_and_its_gaps_are_free():
 
 
 def test_sand_to_begin_from_can_be_given():
-    start = np.abs(MAPS)
+    start = np.abs(MAPS) / 4
     for starts, own in ((start[0], start[[0, 0, 0]]), (jnp.asarray(start), start)):
         env, params = weighed(starts=starts)
         assert np.array_equal(params.goals.starts, own)
@@ -206,6 +206,7 @@ def test_a_vector_shows_what_single_environments_show():
         (lambda: weighed(js.Goal(MAPS + np.inf)), "^goals: got 256 cells that are not finite"),
         (lambda: weighed(js.Goal(MAPS[:, :5])), r"^goals: got shape \[5, 16\], the scene has \[16, 16\]"),
         (lambda: weighed(starts=MAPS[:2]), r"^starts: got float32 of shape \[2, 16, 16\] for 3 goals; give a map"),
+        (lambda: weighed(starts=0.1 * np.eye(16)), r"^starts: got a slope of 1\d.*, steeper than repose .*settle it first"),
         (lambda: weighed(starts=MAPS[0, :5]), r"^starts: got shape \[5, 16\], the scene has"),
         (
             lambda: weighed(envs.LevelGoals(js.Goal(MAPS, ABOVE[0]))),

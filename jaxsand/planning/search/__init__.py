@@ -19,7 +19,7 @@ from jaxsand.planning.search.reach import blade_size, least_distance, volume_dis
 from jaxsand.planning.search.rollouts import Effort, distance, replay
 from jaxsand.planning.search.steps import search_steps
 from jaxsand.planning.search.strokes import search_strokes
-from jaxsand.relaxation.settling import steepest_slope
+from jaxsand.relaxation.settling import check_at_rest
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, as_array, blade_of, fit
 from jaxsand.scene.tools import Blade, square
@@ -205,9 +205,7 @@ def _checked(scene: Scene, height: np.ndarray) -> np.ndarray:
     blade_size(scene)
     height = np.asarray(fit(scene, as_array("height", height, np.float32))[1])
     metrics.finite(height, "height")
-    slope, mu = float(steepest_slope(scene, height)), np.tan(np.asarray(scene.material.repose_angle, float))
-    if slope > np.max(mu) + 2e-3:
-        raise ValueError(f"height: got a slope of {slope:.3g}, steeper than repose ({np.max(mu):.3g}); settle it first")
+    check_at_rest(scene, height)
     return height
 
 
