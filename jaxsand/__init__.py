@@ -51,6 +51,8 @@ if TYPE_CHECKING:
     from jaxsand.planning.gradient import Blurred as Blurred
     from jaxsand.planning.gradient import Optimised as Optimised
     from jaxsand.planning.gradient import optimise_strokes as optimise_strokes
+    from jaxsand.planning.pipeline import ShapeResult as ShapeResult
+    from jaxsand.planning.pipeline import film as film
     from jaxsand.planning.search import SandPlan as SandPlan
     from jaxsand.planning.search import plan_sand as plan_sand
     from jaxsand.planning.search.actions import Flat as Flat
@@ -99,6 +101,9 @@ if TYPE_CHECKING:
     from jaxsand.terramechanics.finer import TwoGrids as TwoGrids
     from jaxsand.terramechanics.sections import Section as Section
     from jaxsand.terramechanics.sections import calibrate_sections as calibrate_sections
+    from jaxsand.viz.viewer import Page as Page
+    from jaxsand.viz.viewer import Panel as Panel
+    from jaxsand.viz.viewer import view as view
 
     __version__: str
 
@@ -130,7 +135,9 @@ _HOMES = {
     "Optimised": "planning.gradient",
     "Outcome": "relaxation.stopping",
     "OutcomeError": "interaction.outcome",
+    "Page": "viz.viewer",
     "Pairwise": "relaxation.schemes",
+    "Panel": "viz.viewer",
     "Plan": "planning.binary",
     "Pose": "scene.footprint",
     "PushRule": "interaction.rule",
@@ -141,6 +148,7 @@ _HOMES = {
     "Scene": "scene.scene",
     "Section": "terramechanics.sections",
     "Settled": "relaxation.settling",
+    "ShapeResult": "planning.pipeline",
     "Shaped": "interaction.simulate",
     "Smooth": "scene.tools",
     "SplitPush": "interaction.wheel_closed_form",
@@ -165,6 +173,7 @@ _HOMES = {
     "check": "interaction.outcome",
     "deposit": "interaction.pouring",
     "dump": "interaction.bucket",
+    "film": "planning.pipeline",
     "follow": "interaction.simulate",
     "follow_frames": "interaction.simulate",
     "load_volume": "interaction.bucket",
@@ -183,6 +192,7 @@ _HOMES = {
     "step": "interaction.simulate",
     "step_batch": "interaction.batched",
     "value_and_grad_batch": "interaction.batched",
+    "view": "viz.viewer",
     "volume": "scene.scene",
 }
 __all__ = [*_HOMES]

@@ -26,6 +26,7 @@ ROOMS = {  # rooms of the package with public names, and what else is public in 
     "goals": ("Goals", ("jaxsand.goals.metrics",)),
     "planning": ("Planning", ()),
     "envs": ("Environments", ("jaxsand.envs",)),
+    "viz": ("Pictures", ()),
 }
 LAYERS = (
     "cli",

@@ -67,7 +67,8 @@ def marked(path):
 
 
 @pytest.mark.parametrize("path", [marked(path) for path in runnable(slow=False)], ids=named)
-def test_code_runs(path):
+def test_code_runs(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     names = run(path, slow=False)
     if path == README:
         assert names["batch"].shape == (64, 32, 32)
@@ -84,7 +85,8 @@ def test_drawings_are_understood():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", runnable(slow=True), ids=named)
-def test_slow_code_runs(path):
+def test_slow_code_runs(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     run(path, slow=True)
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jaxsand.planning.pipeline import ShapeResult, Target
     from jaxsand.planning.search import SandPlan
 
+_FILES = ("result.json", "shape.png", "shape.gif")
 _STROKES, _PUSHES = 24, 2000  # of a search for strokes that rise and sink, unless told otherwise
 _REFINED = 4000  # pushes by --refine, unless told otherwise
 
@@ -60,11 +61,14 @@ def run_shape(options: argparse.Namespace) -> None:
     result = shape(target, surface, tell)
     tell("drawing")
     began = time.perf_counter()
-    files = {name: out / name for name in ("result.json", "shape.png", "shape.gif")}
+    files = {name: out / name for name in _FILES + ("shape.html",) * options.html}
     with written(files["shape.png"]) as path:
         save_figure(lambda: shape_figure(result), path)
     with written(files["shape.gif"]) as path:
         save_animation(result, path)
+    if options.html:
+        with written(files["shape.html"]) as path:
+            result.to_html(path)
     if target.method == "strokes":  # a glyph's goal is pushed first, by the same program
         planned -= result.seconds["compile"]
     ended = time.perf_counter()

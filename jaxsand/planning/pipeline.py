@@ -2,10 +2,12 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from importlib import import_module
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -24,7 +26,7 @@ from jaxsand.planning.learned.stages import Planned
 from jaxsand.planning.search import SandPlan
 from jaxsand.relaxation.settling import steepest_slope
 from jaxsand.scene.progress import Tell, quiet
-from jaxsand.scene.scene import Scene, make_scene
+from jaxsand.scene.scene import Scene, blade_of, make_scene
 from jaxsand.scene.tools import Blade
 from jaxsand.scene.window import Whole
 
@@ -120,6 +122,7 @@ class ShapeResult:
       after: the map [H, W] (m) after all strokes.
       frames: maps [F, H, W] (m) on the way, for an animation.
       tools: [F, 4] x, y (m), cos and sin of the tool's heading in each frame; NaN while it is lifted.
+      bottoms: [F] height of the tool's bottom (m) in each frame; NaN while it is lifted.
       figures: iou, l2_reduction (by the goal's weights, if it has any), l2_reduction_with_berms (all cells alike),
         volume_error and max_slope_deg.
       seconds: run times of `prepare`, `compile` and `run`.
@@ -130,6 +133,7 @@ class ShapeResult:
     after: np.ndarray
     frames: np.ndarray
     tools: np.ndarray  # x, y, cos, sin of the tool in each frame; NaN while it is lifted
+    bottoms: np.ndarray
     figures: dict[str, float]
     seconds: dict[str, float]
 
@@ -147,6 +151,18 @@ class ShapeResult:
     def strokes(self) -> list[list[float]]:
         """Every leg as x0, y0, x1, y1 (m), in order, without its heights."""
         return [[float(v) for v in (*a[:2], *b[:2])] for p in self.target.paths for a, b in pairwise(p)]
+
+    def to_html(self, path: str | Path) -> None:
+        """Writes one HTML file in which a browser shows the sand being shaped (see `jaxsand.view`).
+
+        Args:
+          path: the file to write.
+        """
+        import_module("jaxsand").view(self).to_html(path)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the sand being shaped."""
+        return str(import_module("jaxsand").view(self)._repr_html_())
 
 
 def map_target(dig: np.ndarray, start: Cell | None, name: str, layout: Layout) -> Target:
@@ -267,7 +283,7 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) 
     start = at_rest(scene, before, tell)
     prepared = time.perf_counter()
     height, compile_seconds, run_seconds = start, 0.0, 0.0
-    frames, tools = [start], [_nowhere()]
+    frames, tools, bottoms = [start], [_nowhere()], [math.nan]
     ways = [_divided(path, float(scene.grid.spacing)) for path in target.paths]
     longest = _rounded(max(map(len, ways), default=2))
     every = math.ceil(sum(map(len, ways)) * start.nbytes / _KEPT) or 1
@@ -278,13 +294,63 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) 
         shaped, on_the_way = program(jnp.asarray(height), _padded(way, longest))
         check(shaped)
         run_seconds += time.perf_counter() - began_to_run
-        maps, poses = _moments(way, np.asarray(on_the_way), every)
+        maps, poses, heights = _moments(way, np.asarray(on_the_way), every, -target.depth)
         height = np.array(shaped.height)
         frames += [*maps, height]
         tools += [*poses, _nowhere()]
+        bottoms += [*heights, math.nan]
     seconds = {"prepare": prepared - began, "compile": compile_seconds, "run": run_seconds}
     figures = _figures(target, start, height)
-    return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), figures, seconds)
+    return ShapeResult(target, start, height, np.stack(frames), np.stack(tools), np.array(bottoms), figures, seconds)
+
+
+def film(
+    scene: Scene,
+    height: np.ndarray | None,
+    goal: Goal | np.ndarray,
+    paths: Sequence[np.ndarray],
+    *,
+    name: str = "sand",
+    tell: Tell = quiet,
+) -> ShapeResult:
+    """Pushes paths one after the other, such as those of a `SandPlan`, and keeps the maps on the way.
+
+    Args:
+      scene: grid, sand and a `Blade`.
+      height: the map [H, W] (m) to start from, which is settled first; None stands for level sand at 0.
+      goal: a map [H, W] (m) to compare with, NaN where it is free, or a `Goal`.
+      paths: points [n, 2] = x, y (m) of each path, or [n, 3] = x, y, z with the height of the tool's bottom; the tool is
+        lifted between paths.
+      name: for titles.
+      tell: is called with a line of progress.
+
+    Returns:
+      A `ShapeResult` with the maps `before` and `after`, `frames` on the way, and `figures`. A notebook shows it;
+      `to_html(path)` writes it as one file for a browser.
+
+    Raises:
+      ValueError: for a scene without a blade, maps of another shape, and paths that are no points.
+      OutcomeError: if the sand does not come to rest.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
+      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
+      >>> stroke = np.array([[0.04, 0.08], [0.12, 0.08]])
+      >>> result = js.film(scene, None, np.zeros((16, 16)), [stroke])
+      >>> result.steps, result.after.shape
+      (1, (16, 16))
+    """
+    wanted, blade = as_goal(scene, goal), blade_of(scene)
+    ways = tuple(np.asarray(path, np.float32) for path in paths)
+    for k, way in enumerate(ways):
+        if way.ndim != 2 or way.shape[1] not in (2, 3) or len(way) < 2 or not np.isfinite(way).all():
+            raise ValueError(
+                f"paths[{k}]: got shape {list(way.shape)}; give two or more points of 2 or 3 finite numbers (m)"
+            )
+    drawn = not np.any(np.asarray(wanted.height) > 0)
+    target = Target(name, "heights", "strokes", scene, np.asarray(wanted.height), ways, drawn, float(blade.depth))
+    return shape(target, height, tell)
 
 
 def at_rest(scene: Scene, before: np.ndarray | None, tell: Tell) -> np.ndarray:
@@ -360,13 +426,14 @@ def _padded(path: np.ndarray, points: int) -> jax.Array:
     return jnp.asarray(np.concatenate([path, np.repeat(path[-1:], points - len(path), axis=0)]), jnp.float32)
 
 
-def _moments(path: np.ndarray, recorded: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
-    """Every so many of the maps `recorded` after the legs of a path, and the last, and the tool's pose in each; nothing of
-    what was recorded of the padding behind the path.
+def _moments(path: np.ndarray, recorded: np.ndarray, every: int, usual: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Every so many of the maps `recorded` after the legs of a path, and the last, with the tool's pose in each, and the
+    height of its bottom, `usual` for a path without heights; nothing of what was recorded of the padding behind the path.
     """
     after = np.unique(np.append(np.arange(every, len(path), every), len(path) - 1))
     flat = path[:, :2]
-    return recorded[after - 1], np.concatenate([flat[after], _headings(np.diff(flat, axis=0))[after - 1]], 1)
+    poses = np.concatenate([flat[after], _headings(np.diff(flat, axis=0))[after - 1]], 1)
+    return recorded[after - 1], poses, path[after, 2] if path.shape[1] == 3 else np.full(len(after), usual)
 
 
 def _headings(runs: np.ndarray) -> np.ndarray:

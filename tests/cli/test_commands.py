@@ -30,7 +30,7 @@ def run(*arguments, environment=None, **options):
 
 
 def test_shape_writes_its_report_and_pictures(here):
-    done = run("shape", "l.txt", "--out", "out", "--json", "--resolution", "5", cwd=here)
+    done = run("shape", "l.txt", "--out", "out", "--json", "--html", "--resolution", "5", cwd=here)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     report = json.loads(done.stdout)
@@ -42,8 +42,9 @@ def test_shape_writes_its_report_and_pictures(here):
         assert isinstance(report[name], float), name
     assert report["iou"] > 0.7
     assert report["volume_error"] <= 1e-6
-    assert sorted(Path(f).name for f in report["files"]) == ["result.json", "shape.gif", "shape.png"]
-    assert sorted(p.name for p in (here / "out").iterdir()) == ["result.json", "shape.gif", "shape.png"]
+    names = ["result.json", "shape.gif", "shape.html", "shape.png"]
+    assert sorted(Path(f).name for f in report["files"]) == sorted(p.name for p in (here / "out").iterdir()) == names
+    assert "l: 4 steps" in (here / "out" / "shape.html").read_text()
     with Image.open(here / "out" / "shape.png") as picture:
         assert min(picture.size) > 800
     with Image.open(here / "out" / "shape.gif") as film:
