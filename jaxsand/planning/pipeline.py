@@ -126,6 +126,14 @@ class ShapeResult:
       figures: iou, l2_reduction (by the goal's weights, if it has any), l2_reduction_with_berms (all cells alike),
         volume_error and max_slope_deg.
       seconds: run times of `prepare`, `compile` and `run`.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxsand as js
+      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
+      >>> result = js.film(scene, None, np.zeros((16, 16)), [np.array([[0.04, 0.08], [0.12, 0.08]])])
+      >>> len(result.frames) == len(result.tools)
+      True
     """
 
     target: Target
@@ -345,9 +353,7 @@ def film(
     ways = tuple(np.asarray(path, np.float32) for path in paths)
     for k, way in enumerate(ways):
         if way.ndim != 2 or way.shape[1] not in (2, 3) or len(way) < 2 or not np.isfinite(way).all():
-            raise ValueError(
-                f"paths[{k}]: got shape {list(way.shape)}; give two or more points of 2 or 3 finite numbers (m)"
-            )
+            raise ValueError(f"paths[{k}]: got shape {list(way.shape)}; give two points or more, of 2 or 3 finite numbers")
     drawn = not np.any(np.asarray(wanted.height) > 0)
     target = Target(name, "heights", "strokes", scene, np.asarray(wanted.height), ways, drawn, float(blade.depth))
     return shape(target, height, tell)
