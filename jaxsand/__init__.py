@@ -101,6 +101,7 @@ if TYPE_CHECKING:
     from jaxsand.terramechanics.finer import TwoGrids as TwoGrids
     from jaxsand.terramechanics.sections import Section as Section
     from jaxsand.terramechanics.sections import calibrate_sections as calibrate_sections
+    from jaxsand.viz.plot import plot as plot
     from jaxsand.viz.viewer import Page as Page
     from jaxsand.viz.viewer import Panel as Panel
     from jaxsand.viz.viewer import view as view
@@ -182,6 +183,7 @@ _HOMES = {
     "optimise_strokes": "planning.gradient",
     "plan": "planning.binary",
     "plan_sand": "planning.search",
+    "plot": "viz.plot",
     "read_drawing": "goals.drawing",
     "remove": "interaction.pouring",
     "rollout": "interaction.simulate",

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_HEIGHTS = "RdYlBu_r"
-_ERRORS = "PuOr"
+HEIGHTS = "RdYlBu_r"
+"""Colours of heights."""
+ERRORS = "PuOr"
+"""Colours of differences from a goal."""
 _SAND = ((0.42, 0.30, 0.18), (0.80, 0.66, 0.44), (0.98, 0.92, 0.76))  # shadow, level sand, light
 
 
@@ -29,12 +31,12 @@ def shape_figure(result: ShapeResult) -> "Figure":
     axes = figure.subplots(2, 2)
     goal, after = target.goal * 1e3, result.after * 1e3
     top = 2.5e3 * target.depth if target.drawn else _span(goal, after)
-    _map(axes[0, 0], goal, target, "goal", _HEIGHTS, top, "height (mm)")
-    _map(axes[0, 1], after, target, "result and path", _HEIGHTS, top, "height (mm)")
+    _map(axes[0, 0], goal, target, "goal", HEIGHTS, top, "height (mm)")
+    _map(axes[0, 1], after, target, "result and path", HEIGHTS, top, "height (mm)")
     _path(axes[0, 1], result)
     error = after - goal
     span = top if target.drawn else max(_span(error), 1e-2)
-    _map(axes[1, 0], error, target, "result - goal", _ERRORS, span, "difference (mm)")
+    _map(axes[1, 0], error, target, "result - goal", ERRORS, span, "difference (mm)")
     axes[1, 1].imshow(lit(result.after, float(target.scene.grid.spacing)), origin="lower", extent=_extent(target))
     axes[1, 1].set_title("the sand, lit from the north-west", loc="left")
     axes[1, 1].set(xlabel="x (m)", ylabel="y (m)")

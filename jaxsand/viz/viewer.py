@@ -159,13 +159,14 @@ def view(*shown: "Panel | ShapeResult | np.ndarray", spacing: float | None = Non
     """
     if not shown:
         raise ValueError("shown: got nothing; give a map [H, W], a film [F, H, W], a Panel, or what js.film returns")
-    panels = tuple(_panel(one, spacing, f"map {k}" if len(shown) > 1 else "sand") for k, one in enumerate(shown, 1))
+    panels = tuple(as_panel(one, spacing, f"map {k}" if len(shown) > 1 else "sand") for k, one in enumerate(shown, 1))
     if (cells := sum(min(len(one.frames), _MOST_FRAMES) * one.frames[0].size for one in panels)) > _CELLS:
         raise ValueError(f"shown: got {cells} cells in all maps together; give at most {_CELLS}, such as every second cell")
     return Page(panels, panels[0].title if title is None else title)
 
 
-def _panel(one: "Panel | ShapeResult | np.ndarray", spacing: float | None, title: str) -> Panel:
+def as_panel(one: "Panel | ShapeResult | np.ndarray", spacing: float | None, title: str) -> Panel:
+    """The panel that shows it, with a title for a map that has none."""
     if isinstance(one, Panel):
         return one
     if not isinstance(one, ShapeResult):
