@@ -1,6 +1,6 @@
 """A figure of sand: heights, light and shade, a cut through the middle, and how far a goal is."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -50,7 +50,8 @@ def plot(
     rows, columns = height.shape
     figure = Figure(figsize=(11 if wanted is None else 15, 7.5), layout="constrained")
     pictures = ["height", "light"] if wanted is None else ["height", "light", "difference"]
-    axes = figure.subplot_mosaic([pictures, ["cut"] * len(pictures)], height_ratios=(2, 1))
+    mosaic: list[Any] = [pictures, ["cut"] * len(pictures)]
+    axes = figure.subplot_mosaic(mosaic, height_ratios=(2, 1))
     extent = (0.0, columns * dx, 0.0, rows * dx)
     _picture(axes["height"], height, extent, "height", HEIGHTS)
     axes["light"].imshow(lit(height, dx), origin="lower", extent=extent)
