@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from jaxsand.goals.drawing import read_drawing as read_drawing
     from jaxsand.goals.feasible import AtBest as AtBest
     from jaxsand.goals.feasible import at_best as at_best
+    from jaxsand.goals.files import HeightMap as HeightMap
+    from jaxsand.goals.files import hfield_size as hfield_size
+    from jaxsand.goals.files import read_map as read_map
+    from jaxsand.goals.files import write_map as write_map
     from jaxsand.goals.goal import Goal as Goal
     from jaxsand.interaction._path import Pushed as Pushed
     from jaxsand.interaction.batched import step_batch as step_batch
@@ -125,6 +129,7 @@ _HOMES = {
     "Grid": "scene.grid",
     "Grousers": "scene.tools",
     "Heaped": "interaction.load",
+    "HeightMap": "goals.files",
     "Lattice": "planning.search.actions",
     "Load": "interaction.load",
     "Loaded": "interaction.bucket",
@@ -177,6 +182,7 @@ _HOMES = {
     "film": "planning.pipeline",
     "follow": "interaction.simulate",
     "follow_frames": "interaction.simulate",
+    "hfield_size": "goals.files",
     "load_volume": "interaction.bucket",
     "make": "envs",
     "make_scene": "scene.scene",
@@ -185,6 +191,7 @@ _HOMES = {
     "plan_sand": "planning.search",
     "plot": "viz.plot",
     "read_drawing": "goals.drawing",
+    "read_map": "goals.files",
     "remove": "interaction.pouring",
     "rollout": "interaction.simulate",
     "scoop": "interaction.bucket",
@@ -196,6 +203,7 @@ _HOMES = {
     "value_and_grad_batch": "interaction.batched",
     "view": "viz.viewer",
     "volume": "scene.scene",
+    "write_map": "goals.files",
 }
 __all__ = [*_HOMES]
 _OTHER_NAMES = ("env", "forces", "gym", "task", "tasks", "trench")  # modules

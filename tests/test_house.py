@@ -18,7 +18,7 @@ PACKAGE = Path(jaxsand.__file__).parent
 
 HEAVY = {
     "matplotlib": {"viz.render", "viz.trenches", "viz.strokes", "viz.side", "viz.gallery", "viz.plot", "goals.surfaces"},
-    "PIL": {"viz.render", "viz.loads", "goals.letters"},
+    "PIL": {"viz.render", "viz.loads", "goals.letters", "goals.files"},
 }
 
 
