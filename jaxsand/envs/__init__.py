@@ -41,6 +41,7 @@ from jaxsand.envs.onmap import MapParams, MapState, OnMap
 from jaxsand.envs.onsand import OnSand, SandParams, SandState
 from jaxsand.envs.pushing import ByLength, Together
 from jaxsand.envs.spaces import Box, Dict, Discrete
+from jaxsand.envs.wrappers import GymnaxEnv, GymnaxParams, Logged, LoggedState
 from jaxsand.envs.zones import ClippedBy, NoZones, RefusedBy
 from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.blade_stepped import with_near
@@ -60,9 +61,13 @@ __all__ = [
     "Excavate",
     "ExcavateParams",
     "ExcavateState",
+    "GymnaxEnv",
+    "GymnaxParams",
     "Heights",
     "Level",
     "LevelGoals",
+    "Logged",
+    "LoggedState",
     "MapParams",
     "MapPool",
     "MapState",
