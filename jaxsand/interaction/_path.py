@@ -144,6 +144,7 @@ def travelled(
     tool = jax.tree.map(lambda leaf: jnp.where(usable, leaf, bed.spacing), scene.tool)
     deep = extent(scene.tool, heights)
     scale = 4 * (jnp.maximum(largest(intact), bed.elsewhere) + jnp.where(usable, deep, 0))
+    scale = jnp.maximum(scale, bed.spacing * 2.0 ** -jnp.finfo(scale.dtype).nmant)  # a spacing is a number of quanta
     flow = Flow(jnp.asarray(rate), quantum(scale))
     site = Site(
         bed, *centres(scene.grid, height.dtype), tool, jnp.where(usable, lowest(scene.tool), jnp.inf), None, flow, room
