@@ -216,3 +216,10 @@ def test_a_map_too_small_for_a_stroke_is_named():
     scene = js.make_scene((1, 1), 0.02, tool=js.Blade(width=0.02, thickness=0.02))
     with pytest.raises(ValueError, match=r"height: got \[1, 1\] cells, too few for a stroke of 2 spacings"):
         js.plan_sand(scene, np.zeros((1, 1)), np.ones((1, 1)), actions=js.Rising())
+
+
+def test_a_plan_carries_what_sand_can_do_at_best(found):
+    best = js.at_best(SCENE, LEVEL, RAMP)
+    assert found.at_best is not None
+    assert found.at_best.distance_bound == best.distance_bound <= found.lower_bound + 1e-12
+    np.testing.assert_array_equal(found.at_best.height, best.height)
