@@ -83,13 +83,16 @@ def _left_by(height: jax.Array, stroke: jax.Array, sand: jax.Array) -> jax.Array
     k = jnp.clip(jnp.floor((along + thick / 2) / part).astype(int), 0, _PARTS - 1)
     covered = jnp.clip(jnp.minimum(along + thick / 2, length + thick / 2 - along) / spacing + 0.5, 0, 1)
     within = jnp.clip(0.5 - beside / spacing, 0, 1)
-    floor, wall = bottom[k], walls[k, (across > 0).astype(int)]
+    floor, share, right_wall, left_wall, berm = jnp.moveaxis(
+        jnp.stack([bottom, filled, walls[:, 0], walls[:, 1], _root(2 * lost * repose)], axis=1)[k], -1, 0
+    )
+    wall = jnp.where(across > 0, left_wall, right_wall)
     slope = floor + wall / 2 + repose * beside
     slid = (wall > 0) & (abs(beside) < wall / 2 / repose)
-    inner = jnp.minimum(height, floor) + jnp.maximum(floor - height, 0) * filled[k]
+    inner = jnp.minimum(height, floor) + jnp.maximum(floor - height, 0) * share
     inner = jnp.where(slid, jnp.maximum(inner, slope), inner)
     outer = jnp.where(slid, jnp.minimum(height, slope), height)
-    outer += jnp.maximum(_root(2 * lost * repose)[k] - repose * jnp.maximum(beside, 0), 0)
+    outer += jnp.maximum(berm - repose * jnp.maximum(beside, 0), 0)
     beyond = along - length - thick / 2
     heap = jnp.maximum(_root(2 * load / width * repose) - repose * beyond, 0) * within * (beyond > 0)
     return height + covered * (within * (inner - height) + (1 - within) * (outer - height)) + heap
