@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.goals.goal import Goal
 from jaxsand.scene.scene import Scene, blade_of
 
 _PARTS = 48  # of a stroke's way
@@ -35,6 +36,16 @@ def foreseen(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
             some = np.concatenate([some, np.repeat(some[-1:], _TOGETHER - len(some), axis=0)])
         found.append(np.asarray(program(some, strokes[k : k + _TOGETHER], sand)))
     return np.concatenate(found)[:many]
+
+
+def roughly_far(goal: Goal, maps: np.ndarray) -> np.ndarray:
+    """How far (m) foreseen maps [n, H, W] are from the goal, [n]: in float32, which is ten times as fast as `distance`."""
+    return np.asarray(_distances(goal, np.asarray(maps, np.float32)), float)
+
+
+@jax.jit
+def _distances(goal: Goal, maps: jax.Array) -> jax.Array:
+    return goal.distance(maps)
 
 
 @cache

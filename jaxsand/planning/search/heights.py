@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsand.planning.search.actions import Job, Path
 from jaxsand.planning.search.drafts import Ended, best_coverage, least_work, nothing, one_by_one, promising
-from jaxsand.planning.search.foresight import foreseen
+from jaxsand.planning.search.foresight import foreseen, roughly_far
 from jaxsand.planning.search.proposals import around, propose_heights
 from jaxsand.planning.search.rollouts import Effort, distance
 from jaxsand.planning.search.strokes import finish
@@ -105,5 +105,5 @@ def _hopeful(job: Job, plan: np.ndarray, k: int, way: np.ndarray, count: int, rn
     maps = way[k]
     for j in range(k, len(plan)):
         maps = foreseen(job.scene, maps, tried[:, j])
-    ends = distance(way[-1] + (maps[1:] - maps[0]), job.goal)
+    ends = roughly_far(job.goal, way[-1] + (maps[1:] - maps[0]))
     return tried[1:][np.argsort(ends, kind="stable")[:count]]
