@@ -1,7 +1,7 @@
 """Pieces of earth that were shaped: before, the goal, what came of it, and a section through all three."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _SAND = ("#123a5c", "#3f86b0", "#a9cbd6", "#f3ead6", "#dcb27a", "#a8652a", "#5a2f0c")  # from pits to heaps
 _FREE = "#d0d0d0"
 _PER_ROW = 2  # tasks
-_SECTION = (
+_SECTION: tuple[tuple[str, dict[str, Any]], ...] = (
     ("before", {"color": "0.6", "ls": "--", "lw": 1.0}),
     ("goal", {"color": "#2a9d55", "lw": 2.6, "alpha": 0.55}),
     ("result", {"color": "#7a3b0c", "lw": 1.3}),
