@@ -14,7 +14,6 @@ from jaxsand.bench.tables import Row
 from jaxsand.goals.feasible import AtBest, at_best
 from jaxsand.goals.goal import as_goal
 from jaxsand.goals.tasks import TASKS, Task, figures, make_task
-from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.planning.search import plan_sand
@@ -33,8 +32,8 @@ RIVALS: dict[str, Method] = {
     "coverage": earth.coverage_paths,
     "least work": earth.transported,
 }
-SEARCH, CHOICE, GRADIENTS, POLICY = "plan_sand", "plan_sand with four blades", "plan_sand and gradients", "policy"
-METHODS = (*RIVALS, SEARCH, CHOICE, GRADIENTS, POLICY)
+SEARCH, CHOICE, POLICY = "plan_sand", "plan_sand with four blades", "policy"
+METHODS = (*RIVALS, SEARCH, CHOICE, POLICY)
 WIDTHS = (0.75, 1.0, 1.5, 2.0)
 """Of the four blades, in those of the task's own."""
 
@@ -183,23 +182,18 @@ def _planned(task: Task, method: str, pushes: int, seed: int) -> MethodPlan:
         return _by_policy(task)
     blade = blade_of(task.scene)
     tools = [replace(blade, width=times * float(blade.width)) for times in WIDTHS] if method == CHOICE else []
-    budget = pushes // 2 if method == GRADIENTS else pushes
     found = plan_sand(
         task.scene,
         task.start,
         task.goal,
         strokes=task.strokes,
         actions=Rising(),
-        budget=max(1, budget),
+        budget=pushes,
         seed=seed,
         tools=tools,
     )
-    plan, effort = found.strokes.reshape(-1, 6), found.effort
-    left = int(pushes - effort.cost)
-    if method == GRADIENTS and len(plan) and left > 0:
-        refined = optimise_strokes(task.scene, task.goal, start=task.start, guess=plan, budget=left, key=seed)
-        plan, effort = refined.strokes, effort + Effort(full=refined.spent)
-    return MethodPlan(replace(task.scene, tool=found.tool or blade), plan, effort, found.at_best)
+    scene = replace(task.scene, tool=found.tool or blade)
+    return MethodPlan(scene, found.strokes.reshape(-1, 6), found.effort, found.at_best)
 
 
 def _by_policy(task: Task) -> MethodPlan:

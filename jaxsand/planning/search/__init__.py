@@ -108,8 +108,9 @@ def plan_sand(
 
     With `Rising` or `Flat` three plans compete: a coverage path, strokes along the plan of least work (optimal transport),
     and strokes that are each the best of many on the sand before them. The best plan's strokes are then varied one at a
-    time. What a stroke will leave is foreseen in closed form, and only the most promising are pushed.
-    `optimise_strokes(guess=plan.strokes)` goes on from there by gradients.
+    time. What a stroke will leave is foreseen in closed form, and only the most promising are pushed. With a budget of 1,000
+    or more that allows some steps, all strokes at once then follow the gradient through the sand, for three fifths of the
+    pushes; the gradient by a stroke counts as five pushes. `optimise_strokes(guess=plan.strokes)` goes on from there.
 
     Args:
       scene: grid, sand and a `Blade`.
