@@ -10,6 +10,9 @@ from jaxsand.planning.search.rollouts import Effort, distance, pushed
 from jaxsand.planning.search.strokes import finish
 from jaxsand.planning.search.transport import heaviest
 
+MOST_TRIED = 8
+"""Strokes that are pushed of many at most: of 256, the eight that were foreseen best held one of the three best of all."""
+
 _DRAWN = 512  # strokes of which the most promising are foreseen further
 _ROUNDS = 3  # of strokes around those
 _NEAR = 256  # strokes in each
@@ -66,7 +69,7 @@ def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[Ended
     """
     here, (plan, left), effort = job.height, nothing(job), Effort()
     for k in range(job.strokes):
-        count = int((budget - effort.cost) / (job.strokes - k))
+        count = min(int((budget - effort.cost) / (job.strokes - k)), MOST_TRIED)
         if count < 1:
             continue
         tried = promising(job, here, count, rng)

@@ -13,7 +13,15 @@ import numpy as np
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import Plans, adam
 from jaxsand.planning.search.actions import Job, Path
-from jaxsand.planning.search.drafts import Ended, best_coverage, least_work, nothing, one_by_one, promising
+from jaxsand.planning.search.drafts import (
+    MOST_TRIED,
+    Ended,
+    best_coverage,
+    least_work,
+    nothing,
+    one_by_one,
+    promising,
+)
 from jaxsand.planning.search.foresight import foreseen, roughly_far
 from jaxsand.planning.search.proposals import around, propose_heights, within
 from jaxsand.planning.search.rollouts import Effort, distance
@@ -25,7 +33,7 @@ _SHARES = ((best_coverage, 0.1), (least_work, 0.15))  # of the budget but for gr
 _ONE_BY_ONE = 0.35  # of that is for strokes one after the other; the rest varies the best plan
 _VARIANTS = 255  # of a stroke that are foreseen at a time
 _WORK = 24  # pushes for variants of a stroke, all strokes after it counted
-_FEWEST, _MOST = 2, 12  # variants that are pushed
+_FEWEST = 2  # variants that are pushed
 _DOWNHILL = 0.6  # of the budget is for gradients,
 _PAYS, _STEPS = 1000, 6  # which are left out with fewer pushes, or for fewer steps
 _TURN = 10  # steps, after which strokes are varied again
@@ -137,7 +145,7 @@ def _varied(job: Job, known: PushedPlan, budget: float, rng: np.random.Generator
         rest = np.maximum(count - np.arange(min(count + 1, job.strokes)), 1)
         chance = (rest <= room) / np.sqrt(rest)
         k = int(rng.choice(len(rest), p=chance / chance.sum()))
-        some = min(int(np.clip(_WORK / rest[k], _FEWEST, _MOST)), room // int(rest[k]))
+        some = min(int(np.clip(_WORK / rest[k], _FEWEST, MOST_TRIED)), room // int(rest[k]))
         if k == count:
             new = promising(job, way[-1], some, rng)
             tried = np.concatenate([np.repeat(plan[None], len(new), axis=0), new[:, None]], axis=1)
