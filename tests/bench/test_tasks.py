@@ -57,6 +57,7 @@ def test_what_is_there_already_is_not_computed_again(monkeypatch, tmp_path):
 
     monkeypatch.setitem(tasks.RIVALS, "random", dig)
     monkeypatch.setitem(tasks.RIVALS, "coverage", dig)
+    monkeypatch.setattr(tasks, "finish", lambda scene, plans, first, start: np.stack([start, start - 0.001]))
     given = {"names": ("ring", "spread"), "methods": ("random", "coverage"), "instances": 2, "pushes": 3, "out": tmp_path}
     told = []
     whole = bench_tasks(told.append, **given)
