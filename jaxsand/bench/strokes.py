@@ -1,6 +1,5 @@
 """Methods that find strokes at equal numbers of simulator calls, on letters and other goals that strokes make."""
 
-import json
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsand.bench.kept import append_row, known_rows
 from jaxsand.bench.rivals.strokes import RIVALS, BestFound
 from jaxsand.bench.stroke_goals import GOALS, StrokeGoal
 from jaxsand.bench.tables import Row
@@ -76,8 +76,6 @@ def run_all(
     """
     path = out / "strokes.jsonl" if out else None
     known = _known(path) if path else {}
-    if path:
-        _ended(path)
     rows = []
     for goal in some:
         for seed in seeds:
@@ -88,7 +86,7 @@ def run_all(
                 if row is None or not set(budgets) <= set(row["budgets"]):
                     row = want | run_one(method, goal, budgets, seed)
                     if path:
-                        _append(path, json.dumps(row))
+                        append_row(path, row)
                 rows.append(_up_to(row, budgets))
     return rows
 
@@ -220,26 +218,7 @@ def _key(row: Row) -> tuple[Any, ...]:
     return row["method"], row["goal"], row["seed"], row["strokes"]
 
 
-def _ended(path: Path) -> None:
-    """Ends a last line that was cut off, so that what is added comes on a line of its own."""
-    if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):
-        _append(path, "")
-
-
-def _append(path: Path, line: str) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(line + "\n")
-
-
 def _known(path: Path) -> dict[tuple[Any, ...], Row]:
-    """The rows of a file by their keys, of several those with most calls; lines that were cut off are left out."""
-    rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.is_file() else [], 1):
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        if not isinstance(row, dict) or not {"method", "goal", "seed", "strokes", "budgets", "at", "curve"} <= set(row):
-            raise ValueError(f"out: line {number} of {path} is no row of this bench; take it out, or give another folder")
-        rows.append(row)
+    """The rows of a file by their keys, of several those with most calls."""
+    rows = known_rows(path, {"method", "goal", "seed", "strokes", "budgets", "at", "curve"})
     return {_key(row): row for row in sorted(rows, key=lambda row: max(row["budgets"]))}

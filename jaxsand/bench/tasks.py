@@ -2,17 +2,18 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+from pathlib import Path
 
 import numpy as np
 
+from jaxsand.bench.kept import append_row, known_rows
 from jaxsand.bench.rivals import earth
 from jaxsand.bench.tables import Row
-from jaxsand.goals.feasible import at_best
+from jaxsand.goals.feasible import AtBest, at_best
 from jaxsand.goals.goal import as_goal
 from jaxsand.goals.tasks import TASKS, Task, figures, make_task
-from jaxsand.planning.gradient import optimise_strokes
 from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.planning.search import plan_sand
@@ -31,10 +32,13 @@ RIVALS: dict[str, Method] = {
     "coverage": earth.coverage_paths,
     "least work": earth.transported,
 }
-SEARCH, CHOICE, GRADIENTS, POLICY = "plan_sand", "plan_sand with four blades", "plan_sand and gradients", "policy"
-METHODS = (*RIVALS, SEARCH, CHOICE, GRADIENTS, POLICY)
+SEARCH, CHOICE, POLICY = "plan_sand", "plan_sand with four blades", "policy"
+METHODS = (*RIVALS, SEARCH, CHOICE, POLICY)
 WIDTHS = (0.75, 1.0, 1.5, 2.0)
 """Of the four blades, in those of the task's own."""
+
+_CASE = ("task", "method", "key", "budget", "at_most")
+"""What is told of a row: the instance by its key, which seeds the method too, the pushes, and the strokes allowed."""
 
 PUBLISHED: dict[str, float] = {"their policy": 3.4, "their coverage paths": 4.8, "their random actions": 7.2}
 """Mean errors (mm) that Kreis et al. 2025 (arXiv:2509.06469) published, by another tool in another simulator, on 400 goals
@@ -49,8 +53,13 @@ def bench_tasks(
     pushes: int = 500,
     strokes: int | None = None,
     seed: int = 0,
+    out: Path | None = None,
 ) -> dict[str, list[Row]]:
-    """Each method on each task: means over the instances (the worst is `worst_mm`); see `figures`.
+    """Each method on each task: means over the instances, whose keys count up from `seed` (the worst is `worst_mm`); see
+    `figures`.
+
+    A row for each method and instance, with its plan and the map that it leaves, is written to `out`/tasks.jsonl as it
+    comes, and what is there already is not computed again.
 
     Every method may use as many strokes as the task allows, but at most `strokes`, and simulate `pushes` pushes; a gradient
     counts as what it costs. The policy's strokes are as deep as the goal, and are not tried. `path_m` is the length of the
@@ -69,20 +78,29 @@ def bench_tasks(
         for name in given:
             if name not in known:
                 raise ValueError(f"bench tasks: got {name!r}; give some of {', '.join(known)}")
+    path = out / "tasks.jsonl" if out else None
+    there = {_case(row): row for row in known_rows(path, {*_CASE, "plan", "after"})} if path else {}
+    cases: list[Row] = [
+        dict(zip(_CASE, case, strict=True))
+        for case in product(names, methods, range(seed, seed + instances), [pushes], [strokes])
+    ]
+    found = list[Row]()
+    for k, case in enumerate(cases):
+        tell(f"{k + 1} of {len(cases)}: {case['task']} {case['key']}, {case['method']}")
+        row = there.get(_case(case))
+        if row is None:
+            row = case | _one(_at_most(make_task(case["task"], case["key"]), strokes), case["method"], pushes, case["key"])
+            if path:
+                append_row(path, row)
+        found.append(row)
     rows, maps = list[Row](), list[Row]()
+    for name, method in product(names, methods):
+        some = [row for row in found if (row["task"], row["method"]) == (name, method)]
+        means = {key: _mean([row[key] for row in some]) for key in some[0] if key not in (*_CASE, "plan", "after")}
+        rows.append({"task": name, "method": method, **means, "worst_mm": max(row["mean_mm"] for row in some)})
     for name in names:
-        left = list[tuple[float, Row]]()
-        for method in methods:
-            tell(f"{name}: {method}")
-            some = [_at_most(make_task(name, key), strokes) for key in range(seed, seed + instances)]
-            found, after = zip(*(_one(task, method, pushes, seed) for task in some), strict=True)
-            worst = {"worst_mm": max(one["mean_mm"] for one in found)}
-            rows.append(
-                {"task": name, "method": method, **{key: _mean([one[key] for one in found]) for key in found[0]}, **worst}
-            )
-            kept = np.round(after[0].astype(float), 6).tolist()
-            left.append((found[0]["distance"], {"task": name, "key": seed, "method": method, "after": kept}))
-        maps.append(min(left, key=lambda one: one[0])[1])
+        first = min((row for row in found if (row["task"], row["key"]) == (name, seed)), key=lambda row: row["distance"])
+        maps.append({key: first[key] for key in ("task", "key", "method", "after")})
     return {"tasks": rows, "tasks_maps": maps}
 
 
@@ -103,27 +121,50 @@ def _mean(values: list[float | None]) -> float | None:
     return float(np.mean(known)) if len(known) == len(values) else None
 
 
-def _one(task: Task, method: str, pushes: int, seed: int) -> tuple[Row, np.ndarray]:
-    """The figures of a method on an instance of a task, and the map [H, W] (m) that it leaves."""
+def _case(row: Row) -> tuple[object, ...]:
+    """What tells a row from others."""
+    return tuple(row[name] for name in _CASE)
+
+
+@dataclass(frozen=True)
+class MethodPlan:
+    """What a method found for a task.
+
+    Attributes:
+      scene: the task's, with the blade of the plan.
+      plan: strokes [n, 6] or [n, 4] (m).
+      effort: what it cost.
+      best: what sand can do at best, where the method knows.
+    """
+
+    scene: Scene
+    plan: np.ndarray
+    effort: Effort
+    best: AtBest | None = None
+
+
+def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
+    """The figures of a method on an instance of a task, its plan, and the map [H, W] (m) that it leaves."""
     began = time.perf_counter()
-    scene, plan, effort = _planned(task, method, pushes, seed)
+    found = _planned(task, method, pushes, seed)
     seconds = time.perf_counter() - began
-    best = at_best(task.scene, task.start, task.goal)
-    maps = finish(scene, plan[None], 0, task.start[None])[:, 0]
+    plan, best = found.plan, found.best or at_best(task.scene, task.start, task.goal)
+    maps = finish(found.scene, plan[None], 0, task.start[None])[:, 0]
     run = plan[:, plan.shape[1] // 2 :] - plan[:, : plan.shape[1] // 2]
     moved = sum(float(np.abs(b.astype(float) - a).sum()) / 2 for a, b in pairwise(maps))
-    row = {
+    return {
         **figures(task, maps[-1]),
         "at_best_mm": figures(task, best.height)["mean_mm"],
         "distance_at_best": best.distance_bound,
         "strokes": float(len(plan)),
         "path_m": float(np.hypot(run[:, 0], run[:, 1]).sum()),
         "moved": moved * float(task.scene.grid.spacing) ** 2,
-        "pushes": effort.cost,
-        "blade_mm": 1e3 * float(blade_of(scene).width),
+        "pushes": found.effort.cost,
+        "blade_mm": 1e3 * float(blade_of(found.scene).width),
         "seconds": seconds,
+        "plan": np.round(plan, 6).tolist(),
+        "after": np.round(maps[-1].astype(float), 6).tolist(),
     }
-    return row, maps[-1]
 
 
 def _at_most(task: Task, strokes: int | None) -> Task:
@@ -131,38 +172,33 @@ def _at_most(task: Task, strokes: int | None) -> Task:
     return task if strokes is None else replace(task, strokes=min(strokes, task.strokes))
 
 
-def _planned(task: Task, method: str, pushes: int, seed: int) -> tuple[Scene, np.ndarray, Effort]:
-    """The scene with the blade, the strokes [n, 6] or [n, 4] (m) of a method, and what they cost."""
+def _planned(task: Task, method: str, pushes: int, seed: int) -> MethodPlan:
+    """What a method finds."""
     if method in RIVALS:
         job = Job(task.scene, task.start, as_goal(task.scene, task.goal), task.strokes, Rising())
         (plan, _), effort = RIVALS[method](job, pushes, np.random.default_rng(seed))
-        return task.scene, plan, effort
+        return MethodPlan(task.scene, plan, effort)
     if method == POLICY:
         return _by_policy(task)
     blade = blade_of(task.scene)
     tools = [replace(blade, width=times * float(blade.width)) for times in WIDTHS] if method == CHOICE else []
-    budget = pushes // 2 if method == GRADIENTS else pushes
     found = plan_sand(
         task.scene,
         task.start,
         task.goal,
         strokes=task.strokes,
         actions=Rising(),
-        budget=max(1, budget),
+        budget=pushes,
         seed=seed,
         tools=tools,
     )
-    plan, effort = found.strokes.reshape(-1, 6), found.effort
-    left = int(pushes - effort.cost)
-    if method == GRADIENTS and len(plan) and left > 0:
-        refined = optimise_strokes(task.scene, task.goal, start=task.start, guess=plan, budget=left, key=seed)
-        return task.scene, refined.strokes, effort + Effort(full=refined.spent)
-    return replace(task.scene, tool=found.tool or blade), plan, effort
+    scene = replace(task.scene, tool=found.tool or blade)
+    return MethodPlan(scene, found.strokes.reshape(-1, 6), found.effort, found.at_best)
 
 
-def _by_policy(task: Task) -> tuple[Scene, np.ndarray, Effort]:
+def _by_policy(task: Task) -> MethodPlan:
     """The shipped policy's strokes, by a blade as deep as the goal lies below height 0, or of the usual depth."""
     depth = -float(np.nanmin(np.asarray(task.goal.height)))
     scene = replace(task.scene, tool=replace(blade_of(task.scene), depth=depth if depth > 0 else Blade().depth))
     found = plan_by_policy(load_policy(), sand_loss(scene, task.start, task.goal), task.strokes, Stages(0, 0), quiet)
-    return scene, found.strokes, Effort(full=found.calls)
+    return MethodPlan(scene, found.strokes, Effort(full=found.calls))

@@ -51,7 +51,7 @@ def run_benchmark(options: argparse.Namespace) -> None:
             from jaxsand.viz.gallery import gallery_figure
 
             with written(out / "bench-tasks.png") as path:
-                save_figure(lambda: gallery_figure(tasks_shown(report["tasks_maps"])), path)
+                save_figure(lambda: gallery_figure(tasks_shown(report.pop("tasks_maps"))), path)
         if "strokes_curves" in report:
             from jaxsand.bench.strokes import REACHED, found
             from jaxsand.viz.strokes import found_figure, strokes_figure
@@ -116,6 +116,7 @@ def _own(options: argparse.Namespace) -> dict[str, Any]:
             "instances": options.seeds,
             "pushes": options.calls,
             "strokes": options.strokes,
+            "out": options.out,
         }
         return {name: value for name, value in given.items() if value}
     if options.goals not in (None, *_STROKE_GOALS):

@@ -171,7 +171,8 @@ def _at_best(result: "ShapeResult") -> dict[str, Any]:
     """What l2 distance repose and volume leave at least, whatever the strokes (m)."""
     from jaxsand.goals.feasible import at_best
 
-    return {"at_best": at_best(result.target.scene, result.before, result.target.goal).distance_bound}
+    known = getattr(result.target.found, "at_best", None)
+    return {"at_best": (known or at_best(result.target.scene, result.before, result.target.goal)).distance_bound}
 
 
 def _summary(report: dict[str, Any]) -> str:

@@ -147,6 +147,7 @@ def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], n
     leaves = jax.tree.leaves(batch)
     _refuse_tracers(leaves)
     total = leaves[0].shape[0]
+    batch, xp = on_host(batch), np if _on_cpu() else jnp
     size = group_size(total, chunk)
     order = np.argsort(-np.nan_to_num(cost(batch), posinf=0, neginf=0), kind="stable")
     extra = -total % size
@@ -160,7 +161,12 @@ def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], n
     with ThreadPoolExecutor(min(cores(), len(filled))) as pool:
         outs = list(pool.map(part, filled))
     back = np.argsort(order)
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *outs)
+    return jax.tree.map(lambda *x: jnp.asarray(xp.concatenate(x)[back]), *outs)
+
+
+def on_host(batch: Tree) -> Tree:
+    """The arrays as numpy's on a CPU, where to index or to join a few maps by JAX takes as long as to push them."""
+    return jax.tree.map(np.asarray, batch) if _on_cpu() else batch
 
 
 def group_size(total: int, chunk: int | None) -> int:

@@ -47,6 +47,48 @@ def test_of_vertical_walls_the_floor_is_told(monkeypatch):
     assert row["at_best_mm"] == pytest.approx(1.65, rel=0.02)
 
 
+def test_what_is_there_already_is_not_computed_again(monkeypatch, tmp_path):
+    """A run that was cut off in the middle of a line goes on there; more instances are added; other options begin anew."""
+    made = []
+
+    def dig(job, budget, rng):
+        made.append(rng.random())
+        return (np.array([[0.05, 0.1, -0.004, 0.2, 0.1, -0.004]]), 0.0), tasks.Effort(full=int(budget))
+
+    monkeypatch.setitem(tasks.RIVALS, "random", dig)
+    monkeypatch.setitem(tasks.RIVALS, "coverage", dig)
+    monkeypatch.setattr(tasks, "finish", lambda scene, plans, first, start: np.stack([start, start - 0.001]))
+    given = {"names": ("ring", "spread"), "methods": ("random", "coverage"), "instances": 2, "pushes": 3, "out": tmp_path}
+    told = []
+    whole = bench_tasks(told.append, **given)
+    assert told[:3] == ["1 of 8: ring 0, random", "2 of 8: ring 1, random", "3 of 8: ring 0, coverage"]
+    assert len(made) == 8
+    assert made[0] != made[1]
+    lines = (tmp_path / "tasks.jsonl").read_text().splitlines()
+    rows = [json.loads(line) for line in lines]
+    assert [(row["task"], row["method"], row["key"]) for row in rows[:3]] == [
+        ("ring", "random", 0),
+        ("ring", "random", 1),
+        ("ring", "coverage", 0),
+    ]
+    assert rows[0]["plan"] == [[0.05, 0.1, -0.004, 0.2, 0.1, -0.004]]
+    assert bench_tasks(**given) == whole
+    assert len(made) == 8
+    (tmp_path / "tasks.jsonl").write_text("\n".join(lines[:5])[:-40])  # cut off in the fifth
+    again = bench_tasks(**given)
+    assert len(made) == 12
+    assert [row["distance"] for row in again["tasks"]] == [row["distance"] for row in whole["tasks"]]
+    assert again["tasks_maps"] == whole["tasks_maps"]
+    assert len(bench_tasks(**given | {"instances": 3, "names": ("spread",)})["tasks"]) == 2
+    assert len(made) == 14
+    for other in ({"pushes": 4}, {"strokes": 1}):
+        bench_tasks(**given | other | {"names": ("ring",), "methods": ("random",), "instances": 1})
+    assert len(made) == 16
+    (tmp_path / "tasks.jsonl").write_text('{"task": "ring"}\n')
+    with pytest.raises(ValueError, match=r"out: line 1 of .* is no row of this bench"):
+        bench_tasks(**given)
+
+
 def test_names_that_do_not_exist_are_refused():
     with pytest.raises(ValueError, match="bench tasks: got 'dance'; give some of level, pad"):
         bench_tasks(names=("dance",))

@@ -8,7 +8,8 @@ import pytest
 import jaxsand as js
 from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.goals.metrics import fits_where_it_counts
-from jaxsand.planning.search import rollouts
+from jaxsand.planning import stroke_loss
+from jaxsand.planning.search import heights, rollouts
 from jaxsand.planning.search.actions import Job
 from jaxsand.planning.search.heights import search_heights
 from jaxsand.planning.search.proposals import around, propose_heights, within
@@ -86,6 +87,43 @@ def test_a_search_with_heights_costs_no_more_than_its_budget(monkeypatch, budget
         assert effort.full == sum(pushes) <= budget
         assert effort.full > budget - 2 * strokes - 1
         assert len(found) <= strokes
+
+
+@pytest.mark.parametrize("strokes", [2, 6])
+def test_gradients_in_a_search_cost_no_more_than_its_budget(monkeypatch, strokes):
+    """Each counts as five pushes; they are left out with few pushes, and for few steps; strokes stay as they are allowed."""
+    pushes, gradients, rng = [], [], np.random.default_rng(0)
+
+    def step_batch(scene, maps, ways):
+        pushes.append(len(ways))
+        moved = np.asarray(maps) + rng.normal(0, 1e-3, np.shape(maps))
+        return SimpleNamespace(height=moved, outcome=np.zeros(len(maps), int))
+
+    def value_and_grad_batch(scene, loss, maps, ways, back):
+        gradients.append(len(ways))
+        assert (ways[:, [2, 5]] <= 0.01 + 1e-6).all()
+        return np.zeros(len(ways)), (back, rng.normal(size=ways.shape))
+
+    for module in (rollouts, stroke_loss):
+        monkeypatch.setattr(module, "step_batch", step_batch)
+    monkeypatch.setattr(stroke_loss, "value_and_grad_batch", value_and_grad_batch)
+    job = Job(SCENE, LEVEL, WANTED, strokes, js.Rising(highest=0.01))
+    for budget in (999, 1300):
+        pushes.clear()
+        found, effort = search_heights(job, budget, np.random.default_rng(1))
+        assert effort.full == sum(pushes) + stroke_loss.GRADIENT * sum(gradients) <= budget
+        assert effort.full > budget - 2 * strokes - 1
+        assert len(found) <= strokes
+        assert all(path[:, 2].max() <= 0.01 for path in found)
+        assert (0.2 if budget > 1000 else 0) <= 5 * sum(gradients) / budget <= (0.6 if budget > 1000 else 0)
+
+
+@pytest.mark.slow
+def test_a_search_that_ends_with_gradients_comes_closer(monkeypatch):
+    with_them = js.plan_sand(SCENE, LEVEL, RAMP, strokes=4, actions=js.Rising(), budget=1000)
+    monkeypatch.setattr(heights, "_PAYS", 1001)
+    without = js.plan_sand(SCENE, LEVEL, RAMP, strokes=4, actions=js.Rising(), budget=1000)
+    assert with_them.after < 0.95 * without.after
 
 
 @pytest.mark.parametrize(
@@ -216,3 +254,10 @@ def test_a_map_too_small_for_a_stroke_is_named():
     scene = js.make_scene((1, 1), 0.02, tool=js.Blade(width=0.02, thickness=0.02))
     with pytest.raises(ValueError, match=r"height: got \[1, 1\] cells, too few for a stroke of 2 spacings"):
         js.plan_sand(scene, np.zeros((1, 1)), np.ones((1, 1)), actions=js.Rising())
+
+
+def test_a_plan_carries_what_sand_can_do_at_best(found):
+    best = js.at_best(SCENE, LEVEL, RAMP)
+    assert found.at_best is not None
+    assert found.at_best.distance_bound == best.distance_bound <= found.lower_bound + 1e-12
+    np.testing.assert_array_equal(found.at_best.height, best.height)

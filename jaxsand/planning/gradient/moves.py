@@ -47,10 +47,13 @@ def ranked(plans: np.ndarray, losses: np.ndarray, most: int) -> Plans:
     return Plans(plans[kept], losses[kept])
 
 
-def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 0.0) -> Plans:
-    """Follows the gradient by Adam; its first step is `size` (m) long, its last a tenth of that, in heights less."""
+def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 0.0, *, momentum: float = 0.9) -> Plans:
+    """Follows the gradient by Adam; its first step is `size` (m) long, its last a tenth of that, in heights less.
+
+    Where it leads at last is pushed too, if the budget allows.
+    """
     plans, losses = start.strokes.copy(), start.losses.copy()
-    rule = optax.adam(optax.cosine_decay_schedule(size, max(steps, 1), 0.1), b2=0.95)
+    rule = optax.adam(optax.cosine_decay_schedule(size, max(steps, 1), 0.1), b1=momentum, b2=0.95)
     here = plans.copy()
     state, units = rule.init(here), _units(here)
     for _ in range(steps):
@@ -61,6 +64,10 @@ def adam(account: Account, start: Plans, steps: int, size: float, blur: float = 
         plans[better], losses[better] = here[better], now[better]
         update, state = rule.update(np.nan_to_num(slope) * units / account.before, state)
         here = account.sand.inside(here + np.asarray(update) * units)
+    if (here != start.strokes).any():
+        now = account.losses(here)
+        better = now < losses
+        plans[better], losses[better] = here[better], now[better]
     return ranked(plans, losses, len(plans))
 
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from jaxsand.goals import metrics
-from jaxsand.goals.feasible import at_best
+from jaxsand.goals.feasible import AtBest, at_best
 from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.planning.no_strokes import why_no_strokes
 from jaxsand.planning.search.actions import Actions, Flat, Job, Lattice, Path, Rising, Steps, longest_stroke
@@ -45,6 +45,7 @@ class SandPlan:
       effort: how many pushes were simulated in full, and how many roughly (see `plan_sand`).
       reason: why there are no paths, and what to do; None where there are some.
       tool: the blade, one of `tools` if there was a choice; None stands for the scene's.
+      at_best: what repose and volume allow, as of `at_best`, with `Rising` or `Flat`; None where it was not asked.
       strokes: every stroke or leg [n, 4] = x0, y0, x1, y1 (m), or [n, 6] = x0, y0, z0, x1, y1, z1 (m) with heights, in
         order.
       gap: after - lower_bound (m).
@@ -68,6 +69,7 @@ class SandPlan:
     effort: Effort
     reason: str | None = None
     tool: Blade | None = None
+    at_best: AtBest | None = None
 
     @property
     def gap(self) -> float:
@@ -106,8 +108,9 @@ def plan_sand(
 
     With `Rising` or `Flat` three plans compete: a coverage path, strokes along the plan of least work (optimal transport),
     and strokes that are each the best of many on the sand before them. The best plan's strokes are then varied one at a
-    time. What a stroke will leave is foreseen in closed form, and only the most promising are pushed.
-    `optimise_strokes(guess=plan.strokes)` goes on from there by gradients.
+    time. What a stroke will leave is foreseen in closed form, and only the most promising are pushed. With a budget of 1,000
+    or more that allows some steps, all strokes at once then follow the gradient through the sand, for three fifths of the
+    pushes; the gradient by a stroke counts as five pushes. `optimise_strokes(guess=plan.strokes)` goes on from there.
 
     Args:
       scene: grid, sand and a `Blade`.
@@ -164,12 +167,14 @@ def plan_sand(
     if left > before:  # `follow` leaves slightly other maps than the search's own pushes
         paths, after, left = [], height, before
     if isinstance(actions, Rising | Flat):
-        bound = max(volume_distance(scene, height, wanted), at_best(scene, height, wanted).distance_bound if before else 0.0)
+        best = at_best(scene, height, wanted) if before else None
+        bound = max(volume_distance(scene, height, wanted), best.distance_bound if best else 0.0)
     else:
+        best = None
         bound = least_distance(scene, height, wanted, strokes, longest_stroke(scene, actions))
     estimate = min(left, max(bound, before - strokes * effort.gain))
     reason = None if paths else why_no_strokes(scene, height, wanted)
-    return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason, blade_of(scene))
+    return SandPlan(tuple(paths), after, before, left, bound, estimate, effort, reason, blade_of(scene), best)
 
 
 def _blades(scene: Scene, tools: Sequence[Blade], actions: Actions) -> tuple[Blade, ...]:

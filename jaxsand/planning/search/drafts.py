@@ -4,11 +4,14 @@ import numpy as np
 
 from jaxsand.planning.search.actions import Job
 from jaxsand.planning.search.coverage import READINGS, coverage
-from jaxsand.planning.search.foresight import foreseen
+from jaxsand.planning.search.foresight import foreseen, roughly_far
 from jaxsand.planning.search.proposals import around, propose_heights, within
 from jaxsand.planning.search.rollouts import Effort, distance, pushed
 from jaxsand.planning.search.strokes import finish
 from jaxsand.planning.search.transport import heaviest
+
+MOST_TRIED = 8
+"""Strokes that are pushed of many at most: of 256, the eight that were foreseen best held one of the three best of all."""
 
 _DRAWN = 512  # strokes of which the most promising are foreseen further
 _ROUNDS = 3  # of strokes around those
@@ -66,7 +69,7 @@ def one_by_one(job: Job, budget: float, rng: np.random.Generator) -> tuple[Ended
     """
     here, (plan, left), effort = job.height, nothing(job), Effort()
     for k in range(job.strokes):
-        count = int((budget - effort.cost) / (job.strokes - k))
+        count = min(int((budget - effort.cost) / (job.strokes - k)), MOST_TRIED)
         if count < 1:
             continue
         tried = promising(job, here, count, rng)
@@ -87,12 +90,12 @@ def promising(job: Job, here: np.ndarray, count: int, rng: np.random.Generator) 
     """
     first = within(job, heaviest(job.scene, job.goal, here))
     some = np.concatenate([first, propose_heights(job, here, _DRAWN - len(first), rng)])
-    far = distance(foreseen(job.scene, here, some), job.goal)
+    far = roughly_far(job.goal, foreseen(job.scene, here, some))
     for turn in range(_ROUNDS):
         order = np.argsort(far, kind="stable")[:_KEPT]
         near = around(job, here, some[order], _NEAR, 0.5**turn, rng)
         some = np.concatenate([some[order], near])
-        far = np.concatenate([far[order], distance(foreseen(job.scene, here, near), job.goal)])
+        far = np.concatenate([far[order], roughly_far(job.goal, foreseen(job.scene, here, near))])
     spacing, kept = float(job.scene.grid.spacing), list[int]()
     for i in np.argsort(far, kind="stable"):
         apart = np.abs(some[kept] - some[i]) / spacing * [1, 1, 0.2, 1, 1, 0.2]

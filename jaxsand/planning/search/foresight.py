@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsand.goals.goal import Goal
 from jaxsand.scene.scene import Scene, blade_of
 
 _PARTS = 48  # of a stroke's way
@@ -35,6 +36,16 @@ def foreseen(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
             some = np.concatenate([some, np.repeat(some[-1:], _TOGETHER - len(some), axis=0)])
         found.append(np.asarray(program(some, strokes[k : k + _TOGETHER], sand)))
     return np.concatenate(found)[:many]
+
+
+def roughly_far(goal: Goal, maps: np.ndarray) -> np.ndarray:
+    """How far (m) foreseen maps [n, H, W] are from the goal, [n]: in float32, which is ten times as fast as `distance`."""
+    return np.asarray(_distances(goal, np.asarray(maps, np.float32)), float)
+
+
+@jax.jit
+def _distances(goal: Goal, maps: jax.Array) -> jax.Array:
+    return goal.distance(maps)
 
 
 @cache
@@ -83,13 +94,16 @@ def _left_by(height: jax.Array, stroke: jax.Array, sand: jax.Array) -> jax.Array
     k = jnp.clip(jnp.floor((along + thick / 2) / part).astype(int), 0, _PARTS - 1)
     covered = jnp.clip(jnp.minimum(along + thick / 2, length + thick / 2 - along) / spacing + 0.5, 0, 1)
     within = jnp.clip(0.5 - beside / spacing, 0, 1)
-    floor, wall = bottom[k], walls[k, (across > 0).astype(int)]
+    floor, share, right_wall, left_wall, berm = jnp.moveaxis(
+        jnp.stack([bottom, filled, walls[:, 0], walls[:, 1], _root(2 * lost * repose)], axis=1)[k], -1, 0
+    )
+    wall = jnp.where(across > 0, left_wall, right_wall)
     slope = floor + wall / 2 + repose * beside
     slid = (wall > 0) & (abs(beside) < wall / 2 / repose)
-    inner = jnp.minimum(height, floor) + jnp.maximum(floor - height, 0) * filled[k]
+    inner = jnp.minimum(height, floor) + jnp.maximum(floor - height, 0) * share
     inner = jnp.where(slid, jnp.maximum(inner, slope), inner)
     outer = jnp.where(slid, jnp.minimum(height, slope), height)
-    outer += jnp.maximum(_root(2 * lost * repose)[k] - repose * jnp.maximum(beside, 0), 0)
+    outer += jnp.maximum(berm - repose * jnp.maximum(beside, 0), 0)
     beyond = along - length - thick / 2
     heap = jnp.maximum(_root(2 * load / width * repose) - repose * beyond, 0) * within * (beyond > 0)
     return height + covered * (within * (inner - height) + (1 - within) * (outer - height)) + heap

@@ -3,8 +3,6 @@
 After the earth-moving plans by optimal transport of arXiv:2303.17047.
 """
 
-from itertools import product
-
 import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
@@ -74,15 +72,13 @@ def flows(goal: Goal, height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
 
 def _blocks(amount: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places [n, 2] (row, column; cells) and sums of an amount [H, W] in square blocks, at most `_BLOCKS` that are not 0."""
-    size = 1
+    size, places = 1, np.indices(amount.shape)
     while True:
-        places, sums = [], []
-        for row, column in product(range(0, amount.shape[0], size), range(0, amount.shape[1], size)):
-            some = amount[row : row + size, column : column + size]
-            if (whole := some.sum()) > 0:
-                at = np.indices(some.shape).reshape(2, -1) + np.array([[row], [column]])
-                places.append((at * some.ravel()).sum(1) / whole)
-                sums.append(whole)
-        if len(sums) <= _BLOCKS:
-            return np.array(places).reshape(-1, 2), np.array(sums)
+        of = [np.arange(0, n, size) for n in amount.shape]
+        whole, *moments = (
+            np.add.reduceat(np.add.reduceat(x, of[0], axis=0), of[1], axis=1) for x in (amount, *(places * amount))
+        )
+        if np.count_nonzero(whole > 0) <= _BLOCKS:
+            some = whole > 0
+            return np.stack([m[some] / whole[some] for m in moments], axis=1), whole[some]
         size += 1

@@ -1,0 +1,31 @@
+"""Rows of a bench that are kept in a file as they come, so that a run that was cut off goes on where it stopped."""
+
+import json
+from pathlib import Path
+
+from jaxsand.bench.tables import Row
+
+
+def append_row(path: Path, row: Row) -> None:
+    """Adds a row to a file, on a line of its own even if the last line was cut off."""
+    cut = path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n")
+    with path.open("a", encoding="utf-8") as file:
+        file.write("\n" * cut + json.dumps(row) + "\n")
+
+
+def known_rows(path: Path, names: set[str]) -> list[Row]:
+    """The rows of a file, none if it does not exist; lines that were cut off are left out.
+
+    Raises:
+      ValueError: for a line that is no row, or has not all of these names.
+    """
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.is_file() else [], 1):
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if not isinstance(row, dict) or not names <= set(row):
+            raise ValueError(f"out: line {number} of {path} is no row of this bench; take it out, or give another folder")
+        rows.append(row)
+    return rows
