@@ -29,12 +29,14 @@ from jaxsand.planning.learned.network import Params
 from jaxsand.planning.learned.policy import in_batches
 from jaxsand.planning.learned.square_symmetries import turned, turned_strokes
 from train.actor_critic.acting import Chooses, best
-from train.actor_critic.memory import Memory, draw, empty, remembered
-from train.actor_critic.network import StrokeCritic, drawn, log_likelihood, valued
+from train.actor_critic.memory import Batch, Memory, draw, empty, remembered
+from train.actor_critic.network import StrokeCritic, drawn, log_likelihood, looked, valued
 from train.actor_critic.practice import practise
 from train.imitation.apart import judged_apart
 
-_Learned = tuple[Params, Params, optax.OptState]  # parameters, their moving average, the optimiser's state
+Learned = tuple[Params, Params, optax.OptState]
+"""A network's parameters, their moving average, and the optimiser's state."""
+
 _ACTOR = 0.15  # the weight of the actor's loss
 _CALM = 0.02  # the weight in it of the entropy of starts
 _DRAWN = 24  # strokes that the actor draws for its loss
@@ -72,7 +74,7 @@ class ActorCritic:
     rate: float = 7e-4
     decay: int = 1000
     temperature: float = 0.15
-    every: int = 12
+    every: int = 24
     widths: tuple[int, int, int] = (32, 64, 96)
     blocks: tuple[int, int, int] = (1, 2, 2)
 
@@ -97,8 +99,7 @@ class ActorCritic:
         """One chunk of practice and updates.
 
         Returns:
-          The next state, and the metrics: the mean losses of `critic` and `actor`, the mean `reward` of the strokes that
-          episodes went on with, and how many `pushes`.
+          The next state, and the metrics: the mean losses of `critic` and `actor`, and how many `pushes`.
         """
         chunk = int(state.chunk)
         rng = np.random.default_rng([int(state.seed), chunk])
@@ -107,10 +108,7 @@ class ActorCritic:
         memory = remembered(state.memory, tries)
         learned, losses = (state.params, state.average, state.optimiser), []
         for number in range(chunk * self.updates, (chunk + 1) * self.updates):
-            some = draw(memory, rng, self.batch)
-            learned, loss = _improve(
-                self, learned, number, int(rng.integers(1 << 31)), some.goal, some.current, some.strokes, some.reward
-            )
+            learned, loss = improve(self, learned, number, int(rng.integers(1 << 31)), draw(memory, rng, self.batch))
             losses.append(loss)
         critic, actor = np.mean(losses, axis=0)
         figures = {"critic": float(critic), "actor": float(actor), "pushes": float(pushes)}
@@ -139,31 +137,26 @@ def _choose(
 
 @partial(jax.jit, static_argnames="net")
 def _act(net: StrokeCritic, params: Params, key: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
-    scores = net.apply(params, goal, current, method="look")
+    scores = looked(net, params, goal, current)
     strokes, _, own = best(net, params, scores, jax.random.key(key), 1)
     return strokes, own
 
 
 @partial(jax.jit, static_argnames="learner")
-def _improve(
-    learner: ActorCritic,
-    learned: _Learned,
-    number: int,
-    key: int,
-    goal: jax.Array,
-    current: jax.Array,
-    strokes: jax.Array,
-    reward: jax.Array,
-) -> tuple[_Learned, jax.Array]:
-    """One step of gradient descent on states [B, ...] seen in a random view: what is new, and the losses of both."""
+def improve(learner: ActorCritic, learned: Learned, number: int, key: int, some: Batch) -> tuple[Learned, jax.Array]:
+    """One step of gradient descent, the `number`th, on states seen in a random view.
+
+    Returns:
+      The new parameters, their average and the optimiser's state; and the losses of critic and actor [2].
+    """
     params, average, state = learned
     view, draw = jax.random.split(jax.random.key(key))
-    goal, current, strokes = _turned(view, goal, current, strokes)
+    goal, current, strokes = _turned(view, some)
 
     def loss(params: Params) -> tuple[jax.Array, jax.Array]:
-        scores = learner.net.apply(params, goal, current, method="look")
+        scores = looked(learner.net, params, goal, current)
         value = valued(learner.net, params, scores)
-        critic = jnp.mean(optax.huber_loss(value(strokes), reward, delta=1.0))
+        critic = jnp.mean(optax.huber_loss(value(strokes), some.reward, delta=1.0))
         fixed = jax.lax.stop_gradient(scores)
         tried = jnp.concatenate([strokes, drawn(draw, fixed, _DRAWN)], 1)
         weight = jax.nn.softmax(jax.lax.stop_gradient(value(tried)) / learner.temperature, 1)
@@ -180,12 +173,11 @@ def _improve(
     return (params, average, state), losses
 
 
-def _turned(
-    key: jax.Array, goal: jax.Array, current: jax.Array, strokes: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Square maps [B, H, W] and strokes [B, P, 4] (cells) on them, all turned or mirrored in one random way of eight."""
-    ways = [
-        lambda way=way: (turned(goal, way), turned(current, way), turned_strokes(strokes, way, goal.shape[-1]))
-        for way in range(8)
-    ]
-    return jax.lax.switch(jax.random.randint(key, (), 0, 8), ways)
+def _turned(key: jax.Array, some: Batch) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Goals, current maps and strokes of a batch, all turned or mirrored in one random way of eight."""
+    goal, current, strokes = (jnp.asarray(x) for x in (some.goal, some.current, some.strokes))
+
+    def seen(way: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+        return turned(goal, way), turned(current, way), turned_strokes(strokes, way, SHAPE[0])
+
+    return jax.lax.switch(jax.random.randint(key, (), 0, 8), [partial(seen, way) for way in range(8)])

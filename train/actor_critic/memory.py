@@ -46,6 +46,7 @@ class Memory:
     added: np.ndarray
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
     """States to learn from, with goals in hindsight or their own.

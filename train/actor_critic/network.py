@@ -109,6 +109,12 @@ def climbed(value: Value, strokes: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jax.lax.scan(step, (strokes, value(strokes)), jnp.array(_STEPS, strokes.dtype))[0]
 
 
+def looked(net: StrokeCritic, params: Params, goal: jax.Array, current: jax.Array) -> Scores:
+    """What the U-Net says of maps [B, H, W] in units of the blade's depth, in a single view."""
+    scores: Any = net.apply(params, goal, current, method="look")
+    return scores
+
+
 def valued(net: StrokeCritic, params: Params, scores: Scores) -> Value:
     """The critic as a function of strokes on maps of which the U-Net said `scores`."""
 
