@@ -19,7 +19,7 @@ from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Pushed
 from jaxsand.interaction.rule import PushRule
 from jaxsand.interaction.simulate import STROKES, Rules, Shaped, Strokes, checked, lifted, step, windows_for
-from jaxsand.relaxation.batching import in_groups, in_turns, wide_vectors
+from jaxsand.relaxation.batching import in_groups, in_turns, on_host, wide_vectors
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import relax_batch
 from jaxsand.relaxation.stopping import Outcome, Stop, as_batch, check_chunk
@@ -166,14 +166,15 @@ def _batch(
         remedy = f"give [{height.shape[0]}, 4], one stroke for each map, or [{height.shape[0]}, 6] with heights"
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
     check_chunk(chunk)
-    scene, _, rules = checked(scene, height[0], *rules)
+    every = on_host((height, stroke, args))
+    scene, _, rules = checked(scene, every[0][0], *rules)
 
     def run(scene: Scene, who: slice | np.ndarray) -> Tree:
-        batch = jax.tree.map(lambda x: x[who], (height, stroke, args))
+        batch = jax.tree.map(lambda x: x[who], every)
         return in_groups(partial(program, scene, rules), batch, _lengths, chunk)
 
     scenes = [*windows_for(scene, rules[0]), scene]
-    return in_turns([partial(run, one) for one in scenes], _flagged)
+    return jax.tree.map(jnp.asarray, in_turns([partial(run, one) for one in scenes], _flagged))
 
 
 def _lengths(batch: Batch) -> np.ndarray:

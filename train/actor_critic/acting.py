@@ -13,8 +13,8 @@ from jaxsand.planning.learned.policy import in_batches
 from jaxsand.scene.scene import Scene, blade_of
 from train.actor_critic.network import HIGH, LOW, StrokeCritic, climbed, drawn, valued
 
-_DRAWN, _ANYWHERE = 64, 64  # strokes that are valued: by the actor's likelihoods, and uniform on the map
-_CLIMBING = 8  # of them go up the slope of their value
+_DRAWN, _ANYWHERE = 48, 32  # strokes that are valued: by the actor's likelihoods, and uniform on the map
+_CLIMBING = 6  # of them go up the slope of their value
 _SIZES = (1, 8, 64)  # of batches, so that a few programs serve all
 
 
@@ -57,7 +57,7 @@ def _read(net: StrokeCritic, count: int, params: Params, goal: jax.Array, curren
 def best(
     net: StrokeCritic, params: Params, scores: Scores, key: jax.Array, count: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The `count` best strokes [B, count, 4] (cells), their values [B, count], and the strokes drawn [B, 64, 4]."""
+    """The `count` best strokes [B, count, 4] (cells), their values [B, count], and the strokes drawn [B, 48, 4]."""
     draw, spray = jax.random.split(key)
     own = drawn(draw, scores, _DRAWN)
     anywhere = jax.random.uniform(spray, (_ANYWHERE, 4), own.dtype, LOW, HIGH)

@@ -40,7 +40,7 @@ Learned = tuple[Params, Params, optax.OptState]
 _ACTOR = 0.15  # the weight of the actor's loss
 _CALM = 0.02  # the weight in it of the entropy of starts
 _DRAWN = 24  # strokes that the actor draws for its loss
-_SIZES = (64,)  # of the batches in which it chooses while it practises
+_SIZES = (32,)  # of the batches in which it chooses while it practises
 
 
 @jax.tree_util.register_dataclass
