@@ -10,7 +10,7 @@ from train.commands import MINUTES, SHIPPED, run_evaluation, run_shipping, run_t
 _STEPS = {
     "hindsight": "chunks of lessons",
     "dqn": "chunks: steps in all its environments, then updates",
-    "actor-critic": "chunks: two episodes for each of 32 goals, then updates",
+    "actor-critic": "chunks: two episodes for each of 16 goals, then updates",
     "ddpg": "chunks: an episode in each of its 64 environments, then updates",
 }
 _ABOUT = {

@@ -40,7 +40,7 @@ Learned = tuple[Params, Params, optax.OptState]
 _ACTOR = 0.15  # the weight of the actor's loss
 _CALM = 0.02  # the weight in it of the entropy of starts
 _DRAWN = 24  # strokes that the actor draws for its loss
-_SIZES = (32,)  # of the batches in which it chooses while it practises
+_SIZES = (16,)  # of the batches in which it chooses while it practises
 
 
 @jax.tree_util.register_dataclass
@@ -66,7 +66,7 @@ class ActorCritic:
     `batch` states each. The learning rate falls as 1 / sqrt(updates) after `decay` updates.
     """
 
-    plans: int = 32
+    plans: int = 16
     tries: int = 8
     updates: int = 16
     batch: int = 32
