@@ -159,7 +159,8 @@ def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], n
 
     with ThreadPoolExecutor(min(cores(), len(filled))) as pool:
         outs = list(pool.map(part, filled))
-    back, join = np.argsort(order), np.concatenate if _on_cpu() else jnp.concatenate
+    join = np.concatenate if _on_cpu() else jnp.concatenate
+    back = np.argsort(order)
     return jax.tree.map(lambda *x: join(x)[back], *outs)
 
 
