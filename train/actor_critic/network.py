@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from jaxsand.goals.usual import SHAPE
-from jaxsand.planning.learned.network import Look, Params, Scores, ends, in_views, seen_on_lines, spread
+from jaxsand.planning.learned.network import Eye, Params, Scores, ends, in_views, seen_on_lines, spread
 
 Value = Callable[[jax.Array], jax.Array]
 """From strokes [B, P, 4] (cells) to their values [B, P]."""
@@ -38,7 +38,7 @@ class StrokeCritic(nn.Module):
 
     def setup(self) -> None:
         """Makes the layers."""
-        self.eye = Look(self.widths, self.blocks, self.features, self.sights)
+        self.eye = Eye(self.widths, self.blocks, self.features, self.sights)
         self.layers = [nn.Dense(128), nn.Dense(64), nn.Dense(1)]
 
     def __call__(self, goal: jax.Array, current: jax.Array, strokes: jax.Array) -> tuple[Scores, jax.Array]:

@@ -78,7 +78,7 @@ class _Block(nn.Module):
         return x + y
 
 
-class Look(nn.Module):
+class Eye(nn.Module):
     """The U-Net. It works on blocks of 2 x 2 cells, so that most of its work is done on a quarter of the cells or fewer."""
 
     widths: tuple[int, int, int]
@@ -137,7 +137,7 @@ class StrokeNet(nn.Module):
 
     def setup(self) -> None:
         """Makes the layers."""
-        self.eye = Look(self.widths, self.blocks, self.features, self.sights)
+        self.eye = Eye(self.widths, self.blocks, self.features, self.sights)
         self.line = _Line()
 
     def __call__(self, goal: jax.Array, current: jax.Array, strokes: jax.Array) -> tuple[Scores, Lines]:
