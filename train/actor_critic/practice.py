@@ -1,6 +1,7 @@
 """What the actor-critic practises: goals that random strokes leave, and two ways to each of them."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,6 +21,18 @@ _NOISY = 0.4  # of the strokes of its own way
 _NEAR = (-0.7, 0.5)  # logarithms to base 10 of the least and the largest standard deviation (cells) of noise
 _AROUND = 2  # tries around the stroke that an episode goes on with
 _FEWEST = _AROUND + 4  # tries from a state: that stroke, those around it, the best and one around it, and one anywhere
+
+
+@dataclass(frozen=True)
+class _Way:
+    """States on the way of episodes, each with the stroke that was gone on with (`taken`, [N, 4]) and what `choose` gave."""
+
+    goal: np.ndarray
+    current: np.ndarray
+    taken: np.ndarray
+    left: np.ndarray
+    best: np.ndarray
+    drawn: np.ndarray
 
 
 def practise(scene: Scene, rng: np.random.Generator, plans: int, tries: int, choose: Choose) -> tuple[Tries, int]:
@@ -49,28 +62,32 @@ def practise(scene: Scene, rng: np.random.Generator, plans: int, tries: int, cho
     clean = np.isfinite(goal).all((1, 2))
     strokes, numbers, goal, before = strokes[clean], numbers[clean], goal[clean] / depth, before[:, clean] / depth
     which, number = np.nonzero(np.arange(MOST) < numbers[:, None])
-    left = numbers[which] - number - 1
+    current, taken = before[number, which], strokes[which, number] / SPACING
+    plan = _Way(goal[which], current, taken, numbers[which] - number - 1, *choose(goal[which], current))
+    both = _joined([plan, _own_way(scene, rng, goal, numbers, choose)])
+    others = [_near(rng, both.taken) for _ in range(_AROUND)]
+    others += [both.best, _near(rng, both.best), rng.uniform(LOW, HIGH, both.best.shape)]
+    every = np.concatenate([np.stack([both.taken, *others], 1), both.drawn[:, : tries - _FEWEST]], 1).astype(np.float32)
+    after = _after(scene, both.current, every)
+    return Tries(both.goal, both.current, every, after, both.left), 2 * int(numbers.sum()) + every[..., 0].size
 
-    def tried(goal: np.ndarray, current: np.ndarray, taken: np.ndarray | None, left: np.ndarray) -> Tries:
-        best, drawn = choose(goal, current)
-        if taken is None:
-            taken = np.where(rng.random((len(best), 1)) < _NOISY, _near(rng, best), best)
-        near = [_near(rng, taken) for _ in range(_AROUND)]
-        one = rng.uniform(LOW, HIGH, best.shape)
-        others = np.stack([taken, *near, best, _near(rng, best), one], 1)
-        others = np.concatenate([others, drawn[:, : tries - _FEWEST]], 1).astype(np.float32)
-        return Tries(goal, current, others, _after(scene, current, others), left)
 
-    first = tried(goal[which], before[number, which], strokes[which, number] / SPACING, left)
-    parts, current = [], np.zeros_like(goal)
-    for k in range(int(numbers.max(initial=0))):
+def _own_way(scene: Scene, rng: np.random.Generator, goal: np.ndarray, numbers: np.ndarray, choose: Choose) -> _Way:
+    """The states on the way of what `choose` values most, in each episode as many as `numbers` [P] says."""
+    parts, episodes, current = [], [], np.zeros_like(goal)
+    for k in range(int(numbers.max(initial=1))):
         here = np.flatnonzero(numbers > k)
-        parts.append(tried(goal[here], current[here], None, numbers[here] - k - 1))
-        current[here] = parts[-1].after[:, 0]
-    order = np.argsort(np.concatenate([np.flatnonzero(numbers > k) for k in range(len(parts))]), kind="stable")
-    every = [np.concatenate([getattr(part, name) for part in parts])[order] for name in vars(first)]
-    both = Tries(*(np.concatenate([a, b]) for a, b in zip(vars(first).values(), every, strict=True)))
-    return both, int(numbers.sum()) + both.strokes[..., 0].size
+        best, drawn = choose(goal[here], current[here])
+        taken = np.where(rng.random((len(here), 1)) < _NOISY, _near(rng, best), best)
+        parts.append(_Way(goal[here], current[here], taken, numbers[here] - k - 1, best, drawn))
+        episodes.append(here)
+        current[here] = _after(scene, current[here], taken[:, None])[:, 0]
+    joined, order = _joined(parts), np.argsort(np.concatenate(episodes), kind="stable")
+    return _Way(*(part[order] for part in vars(joined).values()))
+
+
+def _joined(ways: list[_Way]) -> _Way:
+    return _Way(*(np.concatenate(parts) for parts in zip(*(vars(one).values() for one in ways), strict=True)))
 
 
 def _near(rng: np.random.Generator, strokes: np.ndarray) -> np.ndarray:
