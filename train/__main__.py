@@ -10,12 +10,14 @@ from train.commands import MINUTES, SHIPPED, run_evaluation, run_shipping, run_t
 _STEPS = {
     "hindsight": "chunks of lessons",
     "dqn": "chunks: steps in all its environments, then updates",
+    "actor-critic": "chunks: two episodes for each of 16 goals, then updates",
     "ddpg": "chunks: an episode in each of its 64 environments, then updates",
 }
 _ABOUT = {
     "hindsight": "the policy that jaxsand ships: which of random strokes are still to come",
     "dqn": "the single stroke on maps",
-    "ddpg": "strokes by DDPG with hindsight experience replay",
+    "actor-critic": "strokes by reward: an actor-critic of DDPG's family that looks along them and acts by samples",
+    "ddpg": "strokes by reward: plain DDPG with hindsight experience replay",
 }
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from train.dqn.learner import Dqn, Walking
     from train.runs.runs import Learner
 
-MINUTES = {"hindsight": 30.0, "dqn": 10.0, "ddpg": 10.0}
+MINUTES = {"hindsight": 30.0, "dqn": 10.0, "actor-critic": 30.0, "ddpg": 10.0}
 """How many minutes each learner trains by default."""
 
 EPISODES = 10_000
@@ -127,6 +127,10 @@ def _made(options: argparse.Namespace) -> tuple["Learner", int | None]:
         from train.dqn.learner import Dqn
 
         return Dqn(), None
+    if options.learner == "actor-critic":
+        from train.actor_critic.learner import ActorCritic
+
+        return ActorCritic(), None
     from train.ddpg.learner import Ddpg
 
     paper = Ddpg.paper()

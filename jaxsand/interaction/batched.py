@@ -166,16 +166,15 @@ def _batch(
         remedy = f"give [{height.shape[0]}, 4], one stroke for each map, or [{height.shape[0]}, 6] with heights"
         raise ValueError(f"stroke: got shape {list(stroke.shape)}; {remedy}")
     check_chunk(chunk)
-    scene, _, rules = checked(scene, height[0], *rules)
-
-    whole = on_host((height, stroke, args))
+    every = on_host((height, stroke, args))
+    scene, _, rules = checked(scene, every[0][0], *rules)
 
     def run(scene: Scene, who: slice | np.ndarray) -> Tree:
-        batch = jax.tree.map(lambda x: x[who], whole)
+        batch = jax.tree.map(lambda x: x[who], every)
         return in_groups(partial(program, scene, rules), batch, _lengths, chunk)
 
     scenes = [*windows_for(scene, rules[0]), scene]
-    return in_turns([partial(run, one) for one in scenes], _flagged)
+    return jax.tree.map(jnp.asarray, in_turns([partial(run, one) for one in scenes], _flagged))
 
 
 def _lengths(batch: Batch) -> np.ndarray:

@@ -142,12 +142,11 @@ SIZES = (8, 16, 32, 64)
 def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], np.ndarray], chunk: int | None) -> Tree:
     """`run` on groups of a batch [B, ...] of like cost, the most expensive first; each free core takes the next group.
 
-    The last group is filled up with copies.
+    The last group is filled up with copies. On a CPU parts are picked and joined by NumPy, which compiles nothing for any
+    number of maps.
     """
-    leaves = jax.tree.leaves(batch)
-    _refuse_tracers(leaves)
-    total = leaves[0].shape[0]
-    batch, xp = on_host(batch), np if _on_cpu() else jnp
+    batch = on_host(batch)
+    total = jax.tree.leaves(batch)[0].shape[0]
     size = group_size(total, chunk)
     order = np.argsort(-np.nan_to_num(cost(batch), posinf=0, neginf=0), kind="stable")
     extra = -total % size
@@ -156,17 +155,23 @@ def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], n
 
     def part(who: np.ndarray) -> Tree:
         with jax.enable_x64(x64):
-            return jax.block_until_ready(run(jax.tree.map(lambda x: x[who], batch)))
+            return on_host(jax.block_until_ready(run(jax.tree.map(lambda x: x[who], batch))))
 
     with ThreadPoolExecutor(min(cores(), len(filled))) as pool:
         outs = list(pool.map(part, filled))
+    join = np.concatenate if _on_cpu() else jnp.concatenate
     back = np.argsort(order)
-    return jax.tree.map(lambda *x: jnp.asarray(xp.concatenate(x)[back]), *outs)
+    return jax.tree.map(lambda *x: jnp.asarray(join(x)[back]), *outs)
 
 
-def on_host(batch: Tree) -> Tree:
-    """The arrays as numpy's on a CPU, where to index or to join a few maps by JAX takes as long as to push them."""
-    return jax.tree.map(np.asarray, batch) if _on_cpu() else batch
+def on_host(tree: Tree) -> Tree:
+    """The arrays of a pytree, on a CPU as NumPy's: there JAX takes as long to pick or join a few maps as to push them.
+
+    Raises:
+      ValueError: inside `jit`, `grad` or `vmap`.
+    """
+    _refuse_tracers(jax.tree.leaves(tree))
+    return jax.tree.map(np.asarray, tree) if _on_cpu() else tree
 
 
 def group_size(total: int, chunk: int | None) -> int:
@@ -196,8 +201,16 @@ def in_turns(runs: Sequence[Callable[[slice | np.ndarray], Tree]], flagged: Call
         left = np.flatnonzero(flagged(out))
         if not left.size:
             break
-        out = jax.tree.map(lambda x, y, left=left: x.at[left].set(y), out, run(left))
+        out = jax.tree.map(partial(_replaced, left), out, run(left))
     return out
+
+
+def _replaced(where: np.ndarray, x: jax.Array | np.ndarray, y: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+    """An array with other rows [where]."""
+    if isinstance(x, jax.Array):
+        return x.at[where].set(y)
+    x[where] = y
+    return x
 
 
 def cores() -> int:

@@ -208,5 +208,5 @@ def test_help_answers_without_jax():
         [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": root}, check=False
     )
     assert got.returncode == 0, got.stderr
-    for word in ("hindsight", "dqn", "ddpg", "evaluate", "ship"):
+    for word in ("hindsight", "dqn", "actor-critic", "ddpg", "evaluate", "ship"):
         assert word in got.stdout

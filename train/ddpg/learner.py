@@ -1,4 +1,4 @@
-"""DDPG with hindsight experience replay, all of it in JAX: environments, replay buffer and updates are one program.
+"""DDPG with hindsight experience replay, all of it in JAX: environments, replay buffer and updates.
 
 Deep deterministic policy gradients (Lillicrap et al. 2016, arXiv:1509.02971). With Q' and pi' the slowly following target
 copies of the critic Q and the actor pi, and o' the observation after o, gradient steps make
@@ -169,20 +169,25 @@ def begin(learner: Ddpg, params: StrokeParams | None, key: jax.Array) -> Practic
     return Practice(agent, _memory(learner).init(row), observation, world, key, jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames="learner")
 def practise(learner: Ddpg, params: StrokeParams | None, state: Practice) -> tuple[Practice, dict[str, jax.Array]]:
-    """One chunk. It may be vmapped over states, for many seeds at once."""
+    """One chunk. It may be vmapped over states, for many seeds at once.
+
+    Steps and updates are programs called one by one: inside a loop of XLA's, a CPU computes convolutions by a path that is
+    an order slower.
+    """
     key, act, learn = jax.random.split(state.key, 3)
-    where, row = _explore(learner, params, state, act)
-    memory = _memory(learner).add(state.memory, row)
-
-    def once(agent: Agent, key: jax.Array) -> tuple[Agent, dict[str, jax.Array]]:
-        draw, relabel = jax.random.split(key)
-        return update(learner, agent, _drawn(learner, relabel, _memory(learner).sample(memory, draw)))
-
-    agent, metrics = jax.lax.scan(once, state.agent, jax.random.split(learn, learner.updates))
-    metrics = {"reward": jnp.mean(row.reward)} | {name: jnp.mean(value) for name, value in metrics.items()}
-    return Practice(agent, memory, *where, key, state.chunk + 1), metrics
+    observation, world, steps = state.observation, state.world, []
+    for k in range(learner.steps):
+        now = jax.random.fold_in(act, k)
+        observation, world, step = _step(learner, params, state.agent.actor, state.chunk, observation, world, now)
+        steps.append(step)
+    memory, reward = _keep(learner, state.memory, steps)
+    agent, made = state.agent, []
+    for k in range(learner.updates):
+        agent, metrics = _improve(learner, agent, memory, jax.random.fold_in(learn, k))
+        made.append(metrics)
+    metrics = {"reward": reward} | {name: jnp.mean(jnp.stack([one[name] for one in made])) for name in made[0]}
+    return Practice(agent, memory, observation, world, key, state.chunk + 1), metrics
 
 
 def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, jax.Array]]:
@@ -214,28 +219,42 @@ def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, j
     return new, {"loss": loss, "value": value}
 
 
-def _explore(
-    learner: Ddpg, params: StrokeParams | None, state: Practice, key: jax.Array
-) -> tuple[tuple[Observation, Any], Steps]:
-    """The environments' observations and states after `steps` steps, and these steps, [E, T, ...]."""
+@partial(jax.jit, static_argnames="learner")
+def _step(
+    learner: Ddpg,
+    params: StrokeParams | None,
+    actor: optax.Params,
+    chunk: jax.Array,
+    observation: Observation,
+    world: Any,
+    key: jax.Array,
+) -> tuple[Observation, Any, Steps]:
+    """The environments' observations and states after one step, and this step, [E, ...]."""
     env, _ = learner.world()
-    share = jnp.where(state.chunk < learner.warm, 1.0, learner.random)
+    share = jnp.where(chunk < learner.warm, 1.0, learner.random)
+    noise, uniform, which, world_key = jax.random.split(key, 4)
+    action, _ = _act(learner, actor, observation)
+    near = action + learner.noise * jax.random.normal(noise, action.shape, action.dtype)
+    anywhere = jax.random.uniform(uniform, action.shape, action.dtype, -1, 1)
+    action = jnp.where(jax.random.uniform(which, (len(action), 1)) < share, anywhere, jnp.clip(near, -1, 1))
+    keys = jax.random.split(world_key, learner.envs)
+    after, world, reward, terminated, truncated, info = jax.vmap(env.step, (0, 0, 0, None))(keys, world, action, params)
+    last, done = info["final_observation"], terminated | truncated
+    return after, world, Steps(_remembered(observation), action, reward, terminated, _remembered(last), done)
 
-    def one(where: tuple[Observation, Any], key: jax.Array) -> tuple[tuple[Observation, Any], Steps]:
-        observation, world = where
-        noise, uniform, which, world_key = jax.random.split(key, 4)
-        action, _ = _act(learner, state.agent.actor, observation)
-        near = action + learner.noise * jax.random.normal(noise, action.shape, action.dtype)
-        anywhere = jax.random.uniform(uniform, action.shape, action.dtype, -1, 1)
-        action = jnp.where(jax.random.uniform(which, (len(action), 1)) < share, anywhere, jnp.clip(near, -1, 1))
-        keys = jax.random.split(world_key, learner.envs)
-        after, world, reward, terminated, truncated, info = jax.vmap(env.step, (0, 0, 0, None))(keys, world, action, params)
-        last = info["final_observation"]
-        done = terminated | truncated
-        return (after, world), Steps(_remembered(observation), action, reward, terminated, _remembered(last), done)
 
-    where, steps = jax.lax.scan(one, (state.observation, state.world), jax.random.split(key, learner.steps))
-    return where, jax.tree.map(lambda x: x.swapaxes(0, 1), steps)
+@partial(jax.jit, static_argnames="learner")
+def _keep(learner: Ddpg, memory: Any, steps: list[Steps]) -> tuple[Any, jax.Array]:
+    """The replay buffer with a row more of each environment, and the mean reward of its steps."""
+    rows = jax.tree.map(lambda *x: jnp.stack(x, 1), *steps)
+    return _memory(learner).add(memory, rows), jnp.mean(rows.reward)
+
+
+@partial(jax.jit, static_argnames="learner")
+def _improve(learner: Ddpg, agent: Agent, memory: Any, key: jax.Array) -> tuple[Agent, dict[str, jax.Array]]:
+    """One update, from a batch that is drawn and relabelled."""
+    draw, relabel = jax.random.split(key)
+    return update(learner, agent, _drawn(learner, relabel, _memory(learner).sample(memory, draw)))
 
 
 def _drawn(learner: Ddpg, key: jax.Array, rows: Steps) -> Steps:

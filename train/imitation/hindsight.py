@@ -14,7 +14,7 @@ al. 2011), so that it learns to go on from its mistakes. It never sees a letter.
 """
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import jax
@@ -22,15 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxsand.goals.metrics import iou
-from jaxsand.goals.success import right, strokes_right
 from jaxsand.goals.usual import SHAPE, SPACING, usual_scene
-from jaxsand.planning.learned.beam_search import one_after_the_other
 from jaxsand.planning.learned.network import Params, StrokeNet, ends, judge, likeliest, spread
 from jaxsand.planning.learned.policy import Policy, in_batches
 from jaxsand.scene.scene import Scene, blade_of
-from train.imitation.lessons import Lessons, lessons, way
-from train.imitation.plans import MOST, random_plans
+from train.imitation.apart import judged_apart
+from train.imitation.lessons import Lessons, lessons
 from train.imitation.sand import other_scene, starts
 
 _Learned = tuple[Params, Params, optax.OptState]  # parameters, their moving average, the optimiser's state
@@ -38,8 +35,6 @@ _WEIGHT = 2.0  # of the loss of pairs: are they due
 _ENDS = 4.0  # and how far are their ends off (cells)
 _HUBER = 0.05  # cells
 _SAME, _OTHER = 1.0, 2.5  # cells: nearer than that to a due stroke is one, farther is none
-_SET_APART = 1_000_003  # the seed of the goals that it is validated on
-_TRIALS = 64  # such goals
 
 
 @jax.tree_util.register_dataclass
@@ -120,25 +115,11 @@ class Hindsight:
         Returns:
           The share of goals that is `right`, the share of `strokes` that are, the `iou`, and the mean of the three, `score`.
         """
-        scene, strokes, numbers, goals = _set_apart()
-        plans, maps = one_after_the_other(self.policy(state), scene, np.zeros_like(goals), goals, MOST)
-        rows = [(strokes[k, :n], plans[k, :n], maps[n, k], goals[k]) for k, n in enumerate(numbers)]
-        good = float(np.mean([right(goal, after, _depth(scene)) for _, _, after, goal in rows]))
-        made = sum(strokes_right(a, b) for a, b, _, _ in rows) / float(numbers.sum())
-        same = float(np.mean([iou(goal, after, _depth(scene)) for _, _, after, goal in rows]))
-        return {"score": (good + made + same) / 3, "right": good, "strokes": made, "iou": same}
+        return judged_apart(self.policy(state))
 
     def policy(self, state: Progress) -> Policy:
         """The network with the averaged parameters."""
         return Policy(self.net, state.average)
-
-
-@cache
-def _set_apart() -> tuple[Scene, np.ndarray, np.ndarray, np.ndarray]:
-    """The scene, the strokes and their numbers, and the goals that they make of level sand, for validation."""
-    scene, rng = usual_scene(), np.random.default_rng(_SET_APART)
-    strokes, numbers = random_plans(rng, _TRIALS)
-    return scene, strokes, numbers, way(scene, starts(scene, rng, _TRIALS, 0.0), strokes, numbers)[0]
 
 
 def _depth(scene: Scene) -> float:

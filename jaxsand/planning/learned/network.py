@@ -30,6 +30,7 @@ _ALONG = 12  # places that are looked at from end to end
 _BEYOND = 1.5  # cells: and one before and one behind
 _ASIDE = (-2.0, -1.0, 1.0, 2.0)  # cells to the left: there only the maps are looked at
 _FARTHEST = 1.5  # cells: an end is moved by less
+_ALIKE = 1.5  # cells: strokes whose numbers differ by less are alike
 
 
 @jax.tree_util.register_dataclass
@@ -77,7 +78,7 @@ class _Block(nn.Module):
         return x + y
 
 
-class _Look(nn.Module):
+class Eye(nn.Module):
     """The U-Net. It works on blocks of 2 x 2 cells, so that most of its work is done on a quarter of the cells or fewer."""
 
     widths: tuple[int, int, int]
@@ -136,7 +137,7 @@ class StrokeNet(nn.Module):
 
     def setup(self) -> None:
         """Makes the layers."""
-        self.eye = _Look(self.widths, self.blocks, self.features, self.sights)
+        self.eye = Eye(self.widths, self.blocks, self.features, self.sights)
         self.line = _Line()
 
     def __call__(self, goal: jax.Array, current: jax.Array, strokes: jax.Array) -> tuple[Scores, Lines]:
@@ -149,12 +150,9 @@ class StrokeNet(nn.Module):
 
     def along(self, scores: Scores, strokes: jax.Array) -> Lines:
         """What the second network says of strokes [B, P, 4] (cells), averaged over all views."""
-        chex.assert_shape(strokes, (scores.sight.shape[0], None, 4))
+        every = in_views(scores, strokes)
         views, side = scores.sight.shape[1], scores.sight.shape[2]
-        every = jnp.stack([turned_strokes(strokes, way, side) for way in range(views)], 1)
-        maps = scores.sight[..., -3:-1]
-        seen = [seen_along(scores.sight, every), *(seen_along(maps, every, aside) for aside in _ASIDE)]
-        said = self.line(jnp.concatenate([x.reshape(*x.shape[:3], -1) for x in seen], -1))
+        said = self.line(seen_on_lines(scores.sight, every))
         ahead = _ahead(every)
         left = _left_of(ahead)
         move = _FARTHEST * jnp.tanh(said[..., 1:])
@@ -163,6 +161,25 @@ class StrokeNet(nn.Module):
         right = jnp.concatenate(ends, -1)
         back = jnp.stack([turned_strokes_back(right[:, way], way, side) for way in range(views)])
         return Lines(said[..., 0].mean(1), back.mean(0))
+
+
+def in_views(scores: Scores, strokes: jax.Array) -> jax.Array:
+    """Strokes [B, P, 4] (cells) as each of the V views shows them, [B, V, P, 4]."""
+    chex.assert_shape(strokes, (scores.sight.shape[0], None, 4))
+    views, side = scores.sight.shape[1], scores.sight.shape[2]
+    return jnp.stack([turned_strokes(strokes, way, side) for way in range(views)], 1)
+
+
+def seen_on_lines(sight: jax.Array, strokes: jax.Array) -> jax.Array:
+    """What there is to see of strokes [B, V, P, 4] (cells), [B, V, P, N]: all features along them, the maps beside them.
+
+    Args:
+      sight: maps [B, V, H, W, C], as of `Scores`.
+      strokes: as `in_views` gives them.
+    """
+    maps = sight[..., -3:-1]
+    seen = [seen_along(sight, strokes), *(seen_along(maps, strokes, aside) for aside in _ASIDE)]
+    return jnp.concatenate([x.reshape(*x.shape[:3], -1) for x in seen], -1)
 
 
 def _ahead(strokes: jax.Array) -> jax.Array:
@@ -247,8 +264,14 @@ def ends(scores: Scores, starts: jax.Array) -> jax.Array:
     return _log_share(jnp.einsum("brk,bijk->brij", query, scores.key))
 
 
-def symmetric(net: StrokeNet, params: Params, goal: jax.Array, current: jax.Array) -> Scores:
-    """The U-Net's scores of square maps, averaged (as logarithms) over the eight turns and mirrors of a square."""
+def symmetric(net: nn.Module, params: Params, goal: jax.Array, current: jax.Array) -> Scores:
+    """The U-Net's scores of square maps, averaged (as logarithms) over the eight turns and mirrors of a square.
+
+    Args:
+      net: a network whose method `look` gives scores.
+      params: its parameters.
+      goal, current: maps [B, H, W] in units of the blade's depth.
+    """
     ways = range(8)
     views = (jnp.concatenate([turned(maps, way) for way in ways]) for maps in (goal, current))
     every: Any = net.apply(params, *views, method="look")
@@ -287,17 +310,27 @@ def likeliest(along: Judge, scores: Scores, count: int) -> tuple[jax.Array, jax.
     """
     strokes, log_shares = jax.lax.map(_candidates, scores)
     lines = along(scores, strokes)
-    score = jax.nn.log_sigmoid(lines.due) + _TRUST * log_shares
+    return best_of(lines.strokes, jax.nn.log_sigmoid(lines.due) + _TRUST * log_shares, count)
+
+
+def best_of(strokes: jax.Array, score: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
+    """Of strokes [B, P, 4] (cells) with scores [B, P], the `count` best, no two alike.
+
+    Strokes are alike if none of their numbers differ by 1.5 cells or more.
+
+    Returns:
+      The strokes [B, count, 4], best first, and their scores [B, count].
+    """
 
     def pick(strokes: jax.Array, score: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(score: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             best = jnp.argmax(score)
-            like = jnp.max(jnp.abs(strokes - strokes[best][None]), -1) < 1.5
+            like = jnp.max(jnp.abs(strokes - strokes[best][None]), -1) < _ALIKE
             return jnp.where(like, score - 1e3, score), (strokes[best], score[best])
 
         return jax.lax.scan(one, score, None, length=count)[1]
 
-    return jax.vmap(pick)(lines.strokes, score)
+    return jax.vmap(pick)(strokes, score)
 
 
 def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
