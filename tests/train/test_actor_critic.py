@@ -147,7 +147,7 @@ def test_the_reward_is_the_squared_distance_that_is_gone():
         some.current[:, 0, 0],
         np.float16(0.1 + some.strokes[:, 0, :1] * 0.001 + [[0, 0.01, 0.02]]),
     )
-    want = SIDE**2 * ((g - h)[:, None] ** 2 - (g[:, None] - after) ** 2) / 20
+    want = SIDE**2 * ((g - h)[:, None] ** 2 - (g[:, None] - after) ** 2) / 5
     np.testing.assert_allclose(some.reward, want, rtol=2e-3, atol=1e-3)
 
 
