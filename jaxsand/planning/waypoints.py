@@ -2,7 +2,9 @@
 
 import csv
 import json
+import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +57,45 @@ def waypoints(scene: Scene, paths: Sequence[np.ndarray], clear: float) -> np.nda
         above = [[*points[end, :2], clear, 1.0] for end in (0, -1)]
         found += [above[0], *np.column_stack([points, np.zeros(len(points))]).tolist(), above[1]]
     return np.array(found).reshape(-1, len(FIELDS))
+
+
+def in_steps(places: np.ndarray, longest: float | Sequence[float]) -> np.ndarray:
+    """Waypoints with others put in between, such that no step from one to the next is longer than a robot can make.
+
+    Each leg is cut into the fewest equal steps that are short enough; where it goes up or down to or from a lifted point,
+    the points in between are not lifted, as they may be in the sand. The way through the air and the way down are steps
+    like all others, so that the number of steps is `len(in_steps(places, longest)) - 1`.
+
+    Args:
+        places: waypoints [n, 4] = x, y, z (m), lifted, such as `waypoints` makes; a first row may say where the tool is.
+        longest: the longest step (m): one number, of the way, or three, along x, y and z each.
+
+    Returns:
+        Waypoints [m, 4], m >= n.
+
+    Raises:
+        ValueError: for places of another shape, or lengths that are not above 0.
+
+    Example:
+        >>> import numpy as np
+        >>> from jaxsand.planning.waypoints import in_steps
+        >>> in_steps(np.array([[0, 0, 0.05, 1], [0, 0, 0, 0], [0.05, 0, 0, 0]]), longest=0.04)[:, :3].tolist()
+        [[0.0, 0.0, 0.05], [0.0, 0.0, 0.025], [0.0, 0.0, 0.0], [0.025, 0.0, 0.0], [0.05, 0.0, 0.0]]
+    """
+    places, most = np.asarray(places, float), np.asarray(longest, float)
+    if places.ndim != 2 or places.shape[1] != len(FIELDS) or not np.all(np.isfinite(places)):
+        raise ValueError(f"places: got shape {list(places.shape)}; give finite waypoints [n, 4] = x, y, z, lifted")
+    if most.shape not in ((), (3,)) or not np.all(most > 0):
+        raise ValueError(f"longest: got {longest!r}; give a length (m) above 0, or three, along x, y and z")
+    found = [places[:1]]
+    for a, b in pairwise(places):
+        way = np.abs(b[:3] - a[:3])
+        steps = max(1, math.ceil((np.linalg.norm(way) / most if most.ndim == 0 else way / most).max() - 1e-9))
+        leg = a + np.arange(1, steps + 1)[:, None] / steps * (b - a)
+        leg[:, 3] = min(a[3], b[3])
+        leg[-1] = b
+        found.append(leg)
+    return np.concatenate(found)
 
 
 def write_waypoints(file: Path | str, places: np.ndarray) -> None:

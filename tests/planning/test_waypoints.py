@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.planning.waypoints import waypoints, write_waypoints
+from jaxsand.planning.waypoints import in_steps, waypoints, write_waypoints
 
 SCENE = js.make_scene((8, 8), 0.01, tool=js.Blade(depth=0.005))
 FLAT, RISING = np.array([[0.02, 0.04], [0.06, 0.04]]), np.array([[0.02, 0.02, -0.01], [0.06, 0.02, 0.0], [0.06, 0.06, 0.01]])
@@ -32,6 +32,40 @@ def test_files_hold_every_digit(tmp_path, kind):
         rows = json.load(text) if kind == "json" else list(csv.DictReader(text))
     read = [[float(row[name]) for name in ("x", "y", "z", "lifted")] for row in rows]
     np.testing.assert_array_equal(read, places)
+
+
+@pytest.mark.parametrize("longest", [0.007, 0.04, 1.0])
+def test_steps_are_the_fewest_that_are_short_enough_and_lie_on_the_way(longest):
+    places = waypoints(SCENE, [FLAT, RISING], CLEAR)
+    cut = in_steps(places, longest)
+    np.testing.assert_array_equal([row for row in cut if (row == places).all(1).any()], places)
+    lengths, legs = (np.linalg.norm(np.diff(points[:, :3], axis=0), axis=1) for points in (cut, places))
+    assert lengths.max() <= longest * (1 + 1e-9)
+    assert lengths.sum() == pytest.approx(legs.sum())
+    assert len(lengths) == np.maximum(1, np.ceil(legs / longest - 1e-9)).sum()
+
+
+def test_steps_through_the_air_are_lifted_and_those_on_the_way_down_are_not():
+    cut = in_steps(waypoints(SCENE, [FLAT[:1], FLAT[1:]], CLEAR), 0.02)
+    assert cut[:, 3].tolist() == [1, 0, 0, 0, 1, 1, 1, 0, 0, 0, 1]
+
+
+def test_a_robot_may_have_a_longest_step_along_each_axis():
+    places = np.array([[0.0, 0, 0.05, 1], [0.04, 0.04, 0.01, 0], [0.04, 0.04, 0.01, 0]])
+    assert len(in_steps(places, [0.04, 0.04, 0.04])) == 3
+    assert len(in_steps(places, 0.04)) == 4
+    assert len(in_steps(places, [0.04, 0.04, 0.01])) == 6
+    np.testing.assert_array_equal(in_steps(places[:1], 0.04), places[:1])
+    assert in_steps(np.zeros((0, 4)), 0.04).shape == (0, 4)
+
+
+def test_what_cannot_be_cut_is_refused():
+    for places in (np.zeros(4), np.zeros((2, 3)), np.full((2, 4), np.nan)):
+        with pytest.raises(ValueError, match="places: got shape"):
+            in_steps(places, 0.04)
+    for longest in (0.0, -0.01, np.nan, [0.04, 0.04], [0.04, 0.0, 0.04]):
+        with pytest.raises(ValueError, match="longest: got"):
+            in_steps(np.zeros((2, 4)), longest)
 
 
 def test_what_cannot_be_replayed_is_refused(tmp_path):
