@@ -39,7 +39,6 @@ def test_losses_and_gradients_are_those_of_each_map_alone():
             assert np.allclose(found[k], slope, atol=1e-9)
 
 
-@pytest.mark.wide
 def test_what_is_not_clean_has_no_loss_and_no_gradient():
     strokes = STROKES.copy()
     strokes[3, 1] = np.nan

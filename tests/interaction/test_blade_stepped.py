@@ -265,7 +265,6 @@ def test_solid_cells_are_left_alone():
     assert volume_error(start, h) <= 1e-12
 
 
-@pytest.mark.wide
 def test_sand_pushed_over_a_draining_edge_is_counted(dtype):
     out = js.step(scene(edge=js.Draining(0.0)), level(dtype), (0.2, 0.16, 0.9, 0.16))
     js.check(out)

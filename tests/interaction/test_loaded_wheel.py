@@ -34,7 +34,6 @@ FIXED = js.make_scene(SHAPE, DX, ANGLE, tool=js.Wheel(**SIZE, sinkage=SINKAGE), 
 at_heights = jax.jit(lambda height, path: js.SteppedPush().along(FIXED, height, path)[0].height)
 
 
-@pytest.mark.wide
 def test_a_rut_is_that_of_the_solved_sinkage_below_the_ground():
     """On level ground and on a slope up from height 0, around a corner; and wherever height 0 is."""
     for slope in (0.0, 0.15):

@@ -49,7 +49,6 @@ def test_the_windrow_lies_on_the_side_to_which_the_face_looks():
     assert (np.diff(ahead) < 0).all()
 
 
-@pytest.mark.wide
 def test_mirrored_sand_is_pushed_by_the_mirrored_blade():
     x0, y0, x1, y1 = STROKE
     found = np.asarray(js.step(sand(0.6), ROUGH, STROKE).height)
