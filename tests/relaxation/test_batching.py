@@ -1,5 +1,7 @@
 """A batch is its maps, one by one: however slow some are, however it is cut up, on however many cores."""
 
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -99,6 +101,22 @@ def test_threads_compute_in_the_callers_precision(monkeypatch):
     assert narrow.height.dtype == jnp.float32
     with jax.enable_x64(True):
         assert js.settle_batch(scene, maps("float64"), chunk=8).height.dtype == jnp.float64
+
+
+@pytest.mark.parametrize("chunk", [None, 4, 100])
+def test_groups_of_like_cost_come_back_in_the_order_of_the_batch(chunk):
+    """Of numbers, whose squares are wanted: each group holds like costs, the dearest first, and copies fill the last."""
+    whole, cost, groups = np.arange(21.0), np.random.default_rng(0).permutation(21), []
+
+    def run(part):
+        groups.append(np.asarray(part))
+        return {"square": jnp.asarray(part) ** 2}
+
+    found = batch.in_groups(run, whole, lambda numbers: cost[numbers.astype(int)], chunk)
+    assert np.array_equal(found["square"], whole**2)
+    assert len({len(group) for group in groups}) == 1
+    costs = sorted((cost[group.astype(int)] for group in groups), key=max, reverse=True)
+    assert all(one.min() >= other.max() for one, other in pairwise(costs))
 
 
 def test_inside_another_program_it_says_what_to_use():
