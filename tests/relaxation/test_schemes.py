@@ -9,6 +9,8 @@ import pytest
 
 import jaxsand as js
 from jaxsand.bench import piles
+from jaxsand.relaxation._rkl import RklStages
+from jaxsand.relaxation.schemes import schedule
 
 from ..conftest import ANGLE, MU
 from .test_settling import DX, rough
@@ -266,3 +268,17 @@ def test_isotropic_sand_sees_a_checkerboard():
     scene = js.make_scene(h.shape, DX, ANGLE, "isotropic")
     assert float(js.steepest_slope(scene, h)) == pytest.approx(math.sqrt(2) * 4)
     js.check(js.settle(scene, h))
+
+
+def test_the_stages_of_a_step_are_runge_kutta_legendres():
+    """On y' = -y a step of s stages, each with its rate c (2 - 1/j) and momentum, gives the Legendre polynomial P_s(1 - c)."""
+    plan = schedule(js.SuperTimeStepping(), limit=0.25, sweeps=64, group=8)
+    rates, momenta = (np.concatenate(x) for x in zip(*(RklStages(plan, 8)._stages(k, float) for k in range(8)), strict=True))
+    ends = [*plan.starts[1:], 64]
+    assert max(np.diff(plan.starts)) > 4
+    for start, end, rate in zip(plan.starts, ends, plan.rates, strict=True):
+        y, last = 1.0, 1.0
+        for r, m in zip(rates[start:end], momenta[start:end], strict=True):
+            y, last = y + m * (y - last) - r * y, y
+        if end < 64:
+            assert y == pytest.approx(np.polynomial.legendre.Legendre.basis(end - start)(1 - rate), abs=1e-6)
