@@ -143,7 +143,7 @@ def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], n
     """`run` on groups of a batch [B, ...] of like cost, the most expensive first; each free core takes the next group.
 
     The last group is filled up with copies. On a CPU parts are picked and joined by NumPy, which compiles nothing for any
-    number of maps.
+    number of maps, and the results are NumPy's.
     """
     batch = on_host(batch)
     total = jax.tree.leaves(batch)[0].shape[0]
@@ -161,7 +161,7 @@ def in_groups(run: Callable[[Tree], Tree], batch: Tree, cost: Callable[[Tree], n
         outs = list(pool.map(part, filled))
     join = np.concatenate if _on_cpu() else jnp.concatenate
     back = np.argsort(order)
-    return jax.tree.map(lambda *x: jnp.asarray(join(x)[back]), *outs)
+    return jax.tree.map(lambda *x: join(x)[back], *outs)
 
 
 def on_host(tree: Tree) -> Tree:

@@ -44,7 +44,7 @@ def plot(
 
     if isinstance(shown, ShapeResult):
         return shape_figure(shown)
-    panel = as_panel(shown, spacing, "sand") if goal is None else Panel(np.asarray(shown), _given(spacing), goal=goal)
+    panel = as_panel(shown, spacing, "sand", goal)
     height, dx = np.asarray(panel.frames[-1], float), panel.spacing
     wanted = None if panel.goal is None else np.asarray(panel.goal, float)
     rows, columns = height.shape
@@ -64,12 +64,6 @@ def plot(
     if panel.title != "sand":
         figure.suptitle(panel.title, parse_math=False)
     return figure
-
-
-def _given(spacing: float | None) -> float:
-    if spacing is None:
-        raise ValueError("spacing: is missing; give the grid's, in metres")
-    return spacing
 
 
 def _picture(axes: "Axes", values: np.ndarray, extent: tuple[float, float, float, float], title: str, colours: str) -> None:

@@ -9,7 +9,7 @@ import html
 import json
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from jaxsand.scene.masked import gaps
 
 _MOST_FRAMES = 100
 _SECONDS = 8.0  # that a film takes at most
-_RATE = 12.0  # maps a second, at most
 _NONE = -32768  # stands for a cell without sand, or free
 _FIGURES = 65534  # of heights that are told apart
 _CELLS = 2**24  # of all maps of a page together
@@ -114,8 +113,7 @@ class Page:
             "span": max(_largest(panel.frames) for panel in shown),
             "difference": max((_largest(panel.frames[-1] - np.asarray(panel.goal)) for panel in goals), default=1.0),
             "stretch": max(1.0, min(10.0, round(2 * 0.12 * reach / relief) / 2)) if relief > 0 else 1.0,
-            "rate": min(_RATE, max(1.0, (frames - 1) / _SECONDS)) if frames < _RATE * _SECONDS else frames / _SECONDS,
-            "last": True,
+            "rate": max(1.0, (frames - 1) / _SECONDS),
         }
         return page.replace("__DATA__", json.dumps(data, allow_nan=False).replace("<", "\\u003c"), 1)
 
@@ -165,19 +163,21 @@ def view(*shown: "Panel | ShapeResult | np.ndarray", spacing: float | None = Non
     return Page(panels, panels[0].title if title is None else title)
 
 
-def as_panel(one: "Panel | ShapeResult | np.ndarray", spacing: float | None, title: str) -> Panel:
-    """The panel that shows it, with a title for a map that has none."""
+def as_panel(
+    one: "Panel | ShapeResult | np.ndarray", spacing: float | None, title: str, goal: np.ndarray | None = None
+) -> Panel:
+    """The panel that shows it, with a title for a map that has none, and beside a goal if one is given."""
     if isinstance(one, Panel):
-        return one
+        return one if goal is None else replace(one, goal=goal)
     if not isinstance(one, ShapeResult):
         if spacing is None:
             raise ValueError("spacing: is missing; give the grid's, in metres")
-        return Panel(np.asarray(gaps(one)), spacing, title)
+        return Panel(np.asarray(gaps(one)), spacing, title, goal)
     target = one.target
     poses = np.concatenate([one.tools, one.bottoms[:, None]], axis=1)
     title = f"{target.name}: {one.steps} {'steps' if target.method == 'plan' else 'strokes'}, IoU {one.figures['iou']:.3f}"
-    goal = np.asarray(target.goal)
-    return Panel(one.frames, float(target.scene.grid.spacing), title, goal, target.paths, poses, target.footprint)
+    wanted = np.asarray(target.goal)
+    return Panel(one.frames, float(target.scene.grid.spacing), title, wanted, target.paths, poses, target.footprint)
 
 
 def _thinned(panel: Panel) -> Panel:
@@ -187,7 +187,7 @@ def _thinned(panel: Panel) -> Panel:
         return panel
     kept = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
     poses = None if panel.poses is None else panel.poses[kept]
-    return Panel(frames[kept], panel.spacing, panel.title, panel.goal, panel.paths, poses, panel.footprint)
+    return replace(panel, heights=frames[kept], poses=poses)
 
 
 def _range(panel: Panel) -> tuple[float, float]:
