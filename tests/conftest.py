@@ -30,7 +30,8 @@ HURRY = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
 }
-WAYS = {"compiled": {}, "slow": {}, "long": {"xla_cpu_use_fusion_emitters": False}}
+OLDER = {"xla_cpu_use_fusion_emitters": False}
+WAYS = {"compiled": {}, "slow": OLDER, "long": OLDER}
 """XLA's options by a test's marker. In a hurry programs are compiled six times as fast, and run four times as slowly; by the
 older emitters alone they are compiled twice as fast, and run as fast."""
 
@@ -103,6 +104,6 @@ def dtype(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture(params=["hurried", pytest.param("compiled", marks=pytest.mark.slow)])
+@pytest.fixture(params=["hurried", pytest.param("compiled", marks=[pytest.mark.slow, pytest.mark.compiled])])
 def both_ways() -> None:
     """By default a test runs in a hurry, and among the slow ones again, compiled as users do."""

@@ -126,14 +126,9 @@ def check_finite(kind, count, seed=0, batch=500):
 
 
 @pytest.mark.slow
-def test_gradients_are_finite_in_2000_cases():
-    check_finite(KINDS[0], 2000)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_gradients_are_finite_in_100_000_cases(kind):
-    check_finite(kind, 100_000 // len(KINDS), seed=1)
+def test_gradients_are_finite_in_extreme_cases(kind):
+    check_finite(kind, 2000, seed=1)
 
 
 def check_smooth_points(case, least, most):
