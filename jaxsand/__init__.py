@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from jaxsand.planning.pipeline import film as film
     from jaxsand.planning.search import SandPlan as SandPlan
     from jaxsand.planning.search import plan_sand as plan_sand
+    from jaxsand.planning.search import plan_sand_batch as plan_sand_batch
     from jaxsand.planning.search.actions import Flat as Flat
     from jaxsand.planning.search.actions import Lattice as Lattice
     from jaxsand.planning.search.actions import Rising as Rising
@@ -189,6 +190,7 @@ _HOMES = {
     "optimise_strokes": "planning.gradient",
     "plan": "planning.binary",
     "plan_sand": "planning.search",
+    "plan_sand_batch": "planning.search",
     "plot": "viz.plot",
     "read_drawing": "goals.drawing",
     "read_map": "goals.files",

@@ -1,8 +1,9 @@
 """Earth-moving tasks by several methods at equal numbers of pushes, with the measures of several fields."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise, product
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from jaxsand.planning.search import plan_sand
 from jaxsand.planning.search.actions import Job, Rising
 from jaxsand.planning.search.rollouts import Effort
 from jaxsand.planning.search.strokes import finish
+from jaxsand.planning.side_by_side import side_by_side
 from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, blade_of
@@ -40,6 +42,9 @@ WIDTHS = (0.75, 1.0, 1.5, 2.0)
 _CASE = ("task", "method", "key", "budget", "at_most")
 """What is told of a row: the instance by its key, which seeds the method too, the pushes, and the strokes allowed."""
 
+_AT_ONCE = 32
+"""Instances that are planned side by side at most."""
+
 PUBLISHED: dict[str, float] = {"their policy": 3.4, "their coverage paths": 4.8, "their random actions": 7.2}
 """Mean errors (mm) that Kreis et al. 2025 (arXiv:2509.06469) published, by another tool in another simulator, on 400 goals
 such as rectangle, L and polygon, of which their data set is not public."""
@@ -58,14 +63,14 @@ def bench_tasks(
     """Each method on each task: means over the instances, whose keys count up from `seed` (the worst is `worst_mm`); see
     `figures`.
 
-    A row for each method and instance, with its plan and the map that it leaves, is written to `out`/tasks.jsonl as it
-    comes, and what is there already is not computed again.
+    The instances of a task are planned side by side by each method. A row for each, with its plan and the map that it
+    leaves, is then written to `out`/tasks.jsonl, and what is there already is not computed again.
 
     Every method may use as many strokes as the task allows, but at most `strokes`, and simulate `pushes` pushes; a gradient
-    counts as what it costs. The policy's strokes are as deep as the goal, and are not tried. `path_m` is the length of the
-    strokes, and `moved` the volume (m^3) that they moved, summed over the strokes. `at_best_mm` is the mean
-    |height - goal| of the map that is nearest by the goal's cost, of all that repose and volume allow, and
-    `distance_at_best` (m) what no method's `distance` can be below (see `at_best`).
+    counts as what it costs. The policy's strokes are as deep as the goal, and are not tried. `seconds` is the time of all
+    instances over their number, `path_m` the length of the strokes, and `moved` the volume (m^3) that they moved, summed
+    over the strokes. `at_best_mm` is the mean |height - goal| of the map that is nearest by the goal's cost, of all that
+    repose and volume allow, and `distance_at_best` (m) what no method's `distance` can be below (see `at_best`).
 
     Returns:
       The rows, as `tasks`; and as `tasks_maps` what the best method leaves of the first instance of each task, with its name
@@ -80,19 +85,18 @@ def bench_tasks(
                 raise ValueError(f"bench tasks: got {name!r}; give some of {', '.join(known)}")
     path = out / "tasks.jsonl" if out else None
     there = {_case(row): row for row in known_rows(path, {*_CASE, "plan", "after"})} if path else {}
-    cases: list[Row] = [
-        dict(zip(_CASE, case, strict=True))
-        for case in product(names, methods, range(seed, seed + instances), [pushes], [strokes])
-    ]
-    found = list[Row]()
-    for k, case in enumerate(cases):
-        tell(f"{k + 1} of {len(cases)}: {case['task']} {case['key']}, {case['method']}")
-        row = there.get(_case(case))
-        if row is None:
-            row = case | _one(_at_most(make_task(case["task"], case["key"]), strokes), case["method"], pushes, case["key"])
-            if path:
-                append_row(path, row)
-        found.append(row)
+    keys, total, found = range(seed, seed + instances), len(names) * len(methods) * instances, list[Row]()
+    for name, method in product(names, methods):
+        cases: list[Row] = [dict(zip(_CASE, (name, method, key, pushes, strokes), strict=True)) for key in keys]
+        old = [there[_case(case)] for case in cases if _case(case) in there]
+        found += old
+        new = [case for case in cases if _case(case) not in there]
+        for some in (new[k : k + _AT_ONCE] for k in range(0, len(new), _AT_ONCE)):
+            tell(f"{len(found)} of {total} done; {name} by {method}, {len(some)} at once")
+            for row in _several(some):
+                found.append(row)
+                if path:
+                    append_row(path, row)
     rows, maps = list[Row](), list[Row]()
     for name, method in product(names, methods):
         some = [row for row in found if (row["task"], row["method"]) == (name, method)]
@@ -143,11 +147,18 @@ class MethodPlan:
     best: AtBest | None = None
 
 
-def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
-    """The figures of a method on an instance of a task, its plan, and the map [H, W] (m) that it leaves."""
+def _several(cases: Sequence[Row]) -> list[Row]:
+    """The rows of some cases, planned side by side."""
     began = time.perf_counter()
-    found = _planned(task, method, pushes, seed)
-    seconds = time.perf_counter() - began
+    figures = side_by_side([partial(_one, case) for case in cases])
+    seconds = (time.perf_counter() - began) / len(cases)
+    return [{**case, **row, "seconds": seconds} for case, row in zip(cases, figures, strict=True)]
+
+
+def _one(case: Row) -> Row:
+    """The figures of a method on an instance of a task, its plan, and the map [H, W] (m) that it leaves."""
+    task = _at_most(make_task(case["task"], case["key"]), case["at_most"])
+    found = _planned(task, case["method"], case["budget"], case["key"])
     plan, best = found.plan, found.best or at_best(task.scene, task.start, task.goal)
     maps = finish(found.scene, plan[None], 0, task.start[None])[:, 0]
     run = plan[:, plan.shape[1] // 2 :] - plan[:, : plan.shape[1] // 2]
@@ -161,7 +172,6 @@ def _one(task: Task, method: str, pushes: int, seed: int) -> Row:
         "moved": moved * float(task.scene.grid.spacing) ** 2,
         "pushes": found.effort.cost,
         "blade_mm": 1e3 * float(blade_of(found.scene).width),
-        "seconds": seconds,
         "plan": np.round(plan, 6).tolist(),
         "after": np.round(maps[-1].astype(float), 6).tolist(),
     }

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -15,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.goals.metrics import fits
 from jaxsand.interaction.batched import step_batch, value_and_grad_batch
+from jaxsand.planning.side_by_side import in_one_batch
 from jaxsand.scene.scene import Scene
 
 GRADIENT = 4
@@ -160,12 +162,16 @@ def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     maps = np.asarray(maps, np.float32)
     if not len(maps):
         return maps
-    shaped = step_batch(scene, maps, np.asarray(strokes, np.float32))
+    shaped = in_one_batch(step_batch, scene, maps, np.asarray(strokes, np.float32))
     return np.where((np.asarray(shaped.outcome) == 0)[:, None, None], np.asarray(shaped.height), np.nan)
 
 
 def _pulled(scene: Scene, maps: np.ndarray, strokes: np.ndarray, back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The cotangents of maps [P, H, W] and strokes [P, 4], from the cotangents of the maps that the strokes leave."""
     maps, strokes, back = (np.asarray(x, np.float32) for x in (maps, strokes, np.nan_to_num(back)))
-    _, (of_maps, of_strokes) = value_and_grad_batch(scene, jnp.vdot, maps, strokes, back)
+    of_maps, of_strokes = in_one_batch(_cotangents, scene, maps, strokes, back)
     return np.asarray(of_maps), np.asarray(of_strokes)
+
+
+def _cotangents(scene: Scene, maps: np.ndarray, strokes: np.ndarray, back: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    return value_and_grad_batch(scene, jnp.vdot, maps, strokes, back)[1]

@@ -61,7 +61,7 @@ def test_what_is_there_already_is_not_computed_again(monkeypatch, tmp_path):
     given = {"names": ("ring", "spread"), "methods": ("random", "coverage"), "instances": 2, "pushes": 3, "out": tmp_path}
     told = []
     whole = bench_tasks(told.append, **given)
-    assert told[:3] == ["1 of 8: ring 0, random", "2 of 8: ring 1, random", "3 of 8: ring 0, coverage"]
+    assert told[:2] == ["0 of 8 done; ring by random, 2 at once", "2 of 8 done; ring by coverage, 2 at once"]
     assert len(made) == 8
     assert made[0] != made[1]
     lines = (tmp_path / "tasks.jsonl").read_text().splitlines()

@@ -64,6 +64,19 @@ def test_gradients_take_a_plan_with_heights_on(found):
         js.optimise_strokes(SCENE, RAMP, guess=np.zeros((1, 5)))
 
 
+def test_goals_planned_side_by_side_have_the_plans_that_each_has_alone():
+    other, given = np.where(INSIDE, -0.01, np.nan), {"strokes": 2, "actions": js.Rising(), "budget": 8}
+    both = js.plan_sand_batch(SCENE, LEVEL, [RAMP, other], seed=3, **given)
+    for k, (plan, goal) in enumerate(zip(both, (RAMP, other), strict=True)):
+        alone = js.plan_sand(SCENE, LEVEL, goal, seed=3 + k, **given)
+        np.testing.assert_allclose(plan.strokes, alone.strokes, atol=1e-9)
+        np.testing.assert_allclose(plan.height, alone.height, atol=1e-6)
+        assert (plan.effort.cost, plan.before) == (alone.effort.cost, alone.before)
+    with pytest.raises(ValueError, match=r"height: got shape \[3, 12, 20\]; give \[H, W\], or \[2, H, W\], one for each goal"):
+        js.plan_sand_batch(SCENE, np.zeros((3, *SHAPE)), [RAMP, other])
+    assert js.plan_sand_batch(SCENE, LEVEL, []) == []
+
+
 @pytest.mark.slow
 def test_gradients_bring_a_ramp_closer(found):
     refined = js.optimise_strokes(SCENE, RAMP, guess=found.strokes, budget=2 * 5 * 20)

@@ -8,8 +8,9 @@ from jaxsand.goals.goal import Goal
 from jaxsand.interaction.batched import act_batch, step_batch
 from jaxsand.interaction.blade_closed_form import SwathPush
 from jaxsand.interaction.outcome import check
-from jaxsand.interaction.simulate import follow
+from jaxsand.interaction.simulate import Shaped, follow
 from jaxsand.planning.search.actions import Path
+from jaxsand.planning.side_by_side import in_one_batch
 from jaxsand.relaxation.settling import Settled, settle_batch
 from jaxsand.relaxation.stopping import Sweeps
 from jaxsand.scene.scene import Scene
@@ -54,7 +55,7 @@ def pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     Raises:
       OutcomeError: if no outcome of the batch is clean.
     """
-    return _clean(step_batch(scene, *_single(maps, strokes)))
+    return _clean(in_one_batch(step_batch, scene, *_single(maps, strokes)))
 
 
 def replay(scene: Scene, height: np.ndarray, paths: list[Path] | tuple[Path, ...]) -> np.ndarray:
@@ -69,7 +70,7 @@ def replay(scene: Scene, height: np.ndarray, paths: list[Path] | tuple[Path, ...
 
 def roughly_pushed(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     """Like `pushed`, in closed form and with 8 sweeps of settling: good enough to rank strokes, not to judge them."""
-    return np.asarray(step_batch(scene, *_single(maps, strokes), push=SwathPush(), stop=Sweeps(8)).height)
+    return np.asarray(in_one_batch(_roughly, scene, *_single(maps, strokes)).height)
 
 
 def walked(scene: Scene, maps: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,8 +80,8 @@ def walked(scene: Scene, maps: np.ndarray, legs: np.ndarray) -> tuple[np.ndarray
       The maps with the tool still down, and the maps with the tool lifted and the sand settled. The tool comes down again at
       the start of each leg, where it had stood; `follow` of the whole path settles a little less.
     """
-    down = act_batch(scene, *_single(maps, legs)).height
-    return np.asarray(down), _clean(settle_batch(scene, down))
+    down = np.asarray(in_one_batch(act_batch, scene, *_single(maps, legs)).height)
+    return down, _clean(in_one_batch(settle_batch, scene, down))
 
 
 def distinct(marks: list[bytes], parent: np.ndarray, order: np.ndarray, count: int, most: int) -> list[int]:
@@ -103,6 +104,10 @@ def marks(maps: np.ndarray, grain: float) -> list[bytes]:
     blocks = whole.reshape(len(maps), rows // 2, 2, columns // 2, 2).mean((2, 4))
     rounded = np.round(np.where(np.isfinite(blocks), blocks, 0) / grain).astype(np.int32)
     return [one.tobytes() for one in rounded]
+
+
+def _roughly(scene: Scene, maps: np.ndarray, strokes: np.ndarray) -> Shaped:
+    return step_batch(scene, maps, strokes, push=SwathPush(), stop=Sweeps(8))
 
 
 def _clean(result: Settled) -> np.ndarray:
