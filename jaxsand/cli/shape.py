@@ -11,6 +11,10 @@ from jaxsand.cli.printing import plain_name, show
 from jaxsand.cli.target import RESOLUTION, read_surface, read_target
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+
     from jaxsand.planning.gradient import Optimised
     from jaxsand.planning.learned.stages import Planned
     from jaxsand.planning.pipeline import ShapeResult, Target
@@ -58,7 +62,7 @@ def run_shape(options: argparse.Namespace) -> None:
 
         target = by_policy(target, surface, strokes, Stages(options.lookahead or 0, polish), tell)
     planned = time.perf_counter() - began
-    result = shape(target, surface, tell)
+    result = shape(target, surface, tell, _live(target) if options.live else lambda _: None)
     tell("drawing")
     began = time.perf_counter()
     files = {name: out / name for name in _FILES + ("shape.html",) * options.html}
@@ -80,6 +84,15 @@ def run_shape(options: argparse.Namespace) -> None:
     if target.missed:
         print(f"warning: goal: {_left_out(target, options)}", file=sys.stderr)
     show(options, report, _summary)
+
+
+def _live(target: "Target") -> "Callable[[np.ndarray], None]":
+    """What draws maps in the terminal, in colours that span the goal's heights."""
+    import numpy as np
+
+    from jaxsand.viz.terminal import live
+
+    return live(max(2 * target.depth, float(np.nanmax(np.abs(target.goal), initial=0))))
 
 
 def _report(result: "ShapeResult", total: float, planned: float, drawn: float, files: dict[str, Path]) -> dict[str, Any]:

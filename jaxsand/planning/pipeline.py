@@ -275,13 +275,16 @@ def image_goal(picture: np.ndarray, layout: Layout, cells: int) -> np.ndarray:
     return np.pad(layout.depth * metrics.resample(picture, (shape[0], shape[1])), layout.margin)
 
 
-def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) -> ShapeResult:
+def shape(
+    target: Target, before: np.ndarray | None = None, tell: Tell = quiet, see: Callable[[np.ndarray], None] = lambda _: None
+) -> ShapeResult:
     """Pushes a target's strokes and measures the result.
 
     Args:
       target: the goal and the strokes.
       before: the surface [H, W] (m), which is settled first; None stands for level sand at 0.
       tell: is called with a line of progress.
+      see: is called with every map [H, W] (m) on the way, as it comes.
 
     Raises:
       OutcomeError: if the sand does not come to rest, or something is not finite.
@@ -304,6 +307,8 @@ def shape(target: Target, before: np.ndarray | None = None, tell: Tell = quiet) 
         run_seconds += time.perf_counter() - began_to_run
         maps, poses, heights = _moments(way, np.asarray(on_the_way), every, -target.depth)
         height = np.array(shaped.height)
+        for one in (*maps, height):
+            see(one)
         frames += [*maps, height]
         tools += [*poses, _nowhere()]
         bottoms += [*heights, math.nan]

@@ -30,7 +30,7 @@ def run(*arguments, environment=None, **options):
 
 
 def test_shape_writes_its_report_and_pictures(here):
-    done = run("shape", "l.txt", "--out", "out", "--json", "--html", "--resolution", "5", cwd=here)
+    done = run("shape", "l.txt", "--out", "out", "--json", "--html", "--live", "--resolution", "5", cwd=here)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     report = json.loads(done.stdout)
