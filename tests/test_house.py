@@ -17,7 +17,16 @@ import jaxsand
 PACKAGE = Path(jaxsand.__file__).parent
 
 HEAVY = {
-    "matplotlib": {"viz.render", "viz.trenches", "viz.strokes", "viz.side", "viz.gallery", "viz.plot", "goals.surfaces"},
+    "matplotlib": {
+        "viz.render",
+        "viz.trenches",
+        "viz.strokes",
+        "viz.terminal",
+        "viz.side",
+        "viz.gallery",
+        "viz.plot",
+        "goals.surfaces",
+    },
     "PIL": {"viz.render", "viz.loads", "goals.letters", "goals.files"},
 }
 

@@ -29,7 +29,7 @@ from jaxsand.scene.window import Whole
 
 Loss = Callable[..., Float[Array, ""]]
 Batch = tuple[jax.Array, jax.Array, tuple[Tree, ...]]  # maps [B, H, W], strokes [B, 4], and what else a loss needs
-_GRADIENTS = 32  # the most maps that are differentiated together, on a CPU
+_GRADIENTS = 16  # the most maps that are differentiated together, on a CPU
 
 
 def step_batch(

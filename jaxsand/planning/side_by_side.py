@@ -1,9 +1,10 @@
 """Searches side by side: what they ask of the simulator at a time is computed in one batch.
 
-A push of one map takes as long as one of eight, and sixteen keep two cores busy. A search pushes a few maps at a time, and
+A push of sixteen maps takes little longer than one of a single map. A search pushes a few maps at a time, and
 looks at them before it goes on; so many searches, each for a goal of its own, go on together. Every search runs in a thread.
-What it asks of the simulator waits until all others that have not ended have asked as well. So the batches, and with them
-the results, do not depend on which thread is faster.
+What it asks of the simulator waits until all others that have not ended have asked as well; then what most of them ask is
+answered, and the few wait until more ask the same. So the batches, and with them the results, do not depend on which thread
+is faster.
 """
 
 import threading
@@ -50,7 +51,7 @@ class _Crowd:
     changed: threading.Condition = field(default_factory=threading.Condition)  # re-entrant
 
     def ask(self, who: int, question: _Question) -> Tree:
-        """The answer to what search `who` asks, once all others have asked too."""
+        """The answer to what search `who` asks, once all others have asked too, and not more of them something else."""
         with self.changed:
             self.asked[who] = question
             self._answer_if_complete()
@@ -75,15 +76,13 @@ class _Crowd:
     def _answer_if_complete(self) -> None:
         if self.error is not None or not self.asked or len(self.asked) < self.running:
             return
-        kinds: dict[Hashable, list[_Question]] = {}
-        for _, question in sorted(self.asked.items()):
-            kinds.setdefault(question.kind, []).append(question)
+        kinds: dict[Hashable, list[int]] = {}
+        for who, question in sorted(self.asked.items()):
+            kinds.setdefault(question.kind, []).append(who)
         try:
-            for alike in kinds.values():
-                _answer(alike)
+            _answer([self.asked.pop(who) for who in max(kinds.values(), key=len)])
         except BaseException as error:
             self.error = error
-        self.asked.clear()
         self.changed.notify_all()
 
 

@@ -72,7 +72,9 @@ def test_goals_planned_side_by_side_have_the_plans_that_each_has_alone():
         np.testing.assert_allclose(plan.strokes, alone.strokes, atol=1e-9)
         np.testing.assert_allclose(plan.height, alone.height, atol=1e-6)
         assert (plan.effort.cost, plan.before) == (alone.effort.cost, alone.before)
-    with pytest.raises(ValueError, match=r"height: got shape \[3, 12, 20\]; give \[H, W\], or \[2, H, W\], one for each goal"):
+    with pytest.raises(
+        ValueError, match=r"height: got shape \[3, 12, 20\]; give \[H, W\], or \[2, H, W\], one for each goal"
+    ):
         js.plan_sand_batch(SCENE, np.zeros((3, *SHAPE)), [RAMP, other])
     assert js.plan_sand_batch(SCENE, LEVEL, []) == []
 

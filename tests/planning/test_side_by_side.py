@@ -58,7 +58,7 @@ def test_the_first_error_ends_all_and_is_raised():
         raise ValueError("depth: got nan; give a number")
 
     def another():
-        while True:
+        for _ in range(1000):
             in_one_batch(simulator.add, SCENE, np.zeros((1, 2, 2)), np.zeros(1))
 
     with pytest.raises(ValueError, match="depth"):
@@ -73,3 +73,23 @@ def test_one_search_or_none_asks_at_once():
     (found,) = side_by_side([partial(search, simulator, SCENE, 2, 1, 5)])
     np.testing.assert_array_equal(found, np.full((1, 2, 2), 6.0))
     assert [n for _, n in simulator.batches] == [1, 1]
+
+
+def test_what_most_ask_is_answered_first_and_the_few_join_later():
+    """One search is a call ahead of two others, which ask something else between; its last call waits for theirs."""
+    simulator, lifted = Simulator(), []
+
+    def lift(scene, maps):
+        lifted.append(len(maps))
+        return maps
+
+    def ahead():
+        return search(simulator, SCENE, 2, 1, 0)
+
+    def behind():
+        in_one_batch(lift, SCENE, search(simulator, SCENE, 1, 1, 0))
+        return search(simulator, SCENE, 1, 1, 0)
+
+    side_by_side([ahead, behind, behind])
+    assert [n for _, n in simulator.batches] == [3, 3]
+    assert lifted == [2]
