@@ -20,10 +20,10 @@ def known_rows(path: Path, names: set[str]) -> list[Row]:
       ValueError: for a line that is no row, or has not all of these names.
     """
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.is_file() else [], 1):
+    for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else [], 1):
         try:
             row = json.loads(line)
-        except json.JSONDecodeError:
+        except (ValueError, RecursionError):
             continue
         if not isinstance(row, dict) or not names <= set(row):
             raise ValueError(f"out: line {number} of {path} is no row of this bench; take it out, or give another folder")

@@ -6,21 +6,27 @@ sign for cells without data; `read_map` and `write_map` say which.
 
 import json
 import math
+import reprlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
+from jaxsand.goals.letters import picture
+from jaxsand.goals.untrusted import read_array, read_arrays, reason
 from jaxsand.scene.masked import gaps
 
 _NO_DATA = -9999.0  # in .asc files that are written
 _LAYER = "elevation"
 _CHUNK = "jaxsand"  # the text of a PNG that holds spacing, lowest height and step
+_TOLD = ("spacing", "lowest", "step", "x", "y")  # what it holds
+_FAR = 1e12  # m: what it may hold
 _MOST = 2**28  # cells of a map that is read
+_HEAD = 20  # lines of an .asc file's header
+_AGAIN = "write it anew with write_map, or check that its suffix says what it is"
 
 
 @dataclass(frozen=True)
@@ -93,14 +99,16 @@ def read_map(path: str | Path, *, spacing: float | None = None) -> HeightMap:
     if (suffix == ".npy") != (spacing is not None):
         raise ValueError(f"spacing: {'is missing' if spacing is None else f'{suffix} files have their own'}; see read_map")
     try:
+        if not path.exists():
+            raise FileNotFoundError
         if suffix == ".npy" and spacing is not None:
-            return HeightMap(np.load(path, allow_pickle=False), spacing)
+            return HeightMap(read_array(path), spacing)
         return readers[suffix](path)
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; check the name") from None
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, SyntaxError) as error:
-        said = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
-        raise ValueError(f"{path}: cannot be read as a height map: {said}") from None
+    except (OSError, ValueError, KeyError) as error:
+        said = f"{error.args[0]} is missing" if isinstance(error, KeyError) else reason(error)
+        raise ValueError(f"{path}: cannot be read as a height map: {said}; {_AGAIN}") from None
 
 
 def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: float | None = None) -> None:
@@ -199,10 +207,13 @@ def _base(one: HeightMap) -> float:
 def _read_asc(path: Path) -> HeightMap:
     lines = path.read_text(encoding="ascii").splitlines()
     head: dict[str, float] = {}
-    while lines and (words := lines[0].split()) and words[0][0].isalpha() and words[0].lower() != "nan":
+    for line in lines[:_HEAD]:
+        words = line.split()
+        if not words or not words[0][0].isalpha() or words[0].lower() in ("nan", "inf"):
+            break
         head[words[0].lower()] = float(words[1]) if len(words) == 2 else math.nan
-        lines.pop(0)
-    shape, spacing = (int(head["nrows"]), int(head["ncols"])), head["cellsize"]
+    lines = lines[len(head) :]
+    shape, spacing = (_cells(head, "nrows"), _cells(head, "ncols")), head["cellsize"]
     if min(shape) < 1 or shape[0] * shape[1] > _MOST:
         raise ValueError(f"it has {shape[0]} rows and {shape[1]} columns")
     values = np.array(" ".join(lines).split(), float)
@@ -213,6 +224,13 @@ def _read_asc(path: Path) -> HeightMap:
         head[f"{axis}llcenter"] - spacing / 2 if f"{axis}llcenter" in head else head[f"{axis}llcorner"] for axis in "xy"
     ]
     return HeightMap(values[::-1].copy(), spacing, (corner[0], corner[1]))
+
+
+def _cells(head: dict[str, float], name: str) -> int:
+    """The number of rows or columns in a header."""
+    if not (0 <= head[name] <= _MOST and head[name] % 1 == 0):
+        raise ValueError(f"{name} is {head[name]:g}")
+    return int(head[name])
 
 
 def _asc(one: HeightMap) -> bytes:
@@ -226,11 +244,20 @@ def _asc(one: HeightMap) -> bytes:
 
 
 def _read_npz(path: Path) -> HeightMap:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-        height, spacing = data[_LAYER], float(data["resolution"])
-        middle = data["position"] if "position" in data else np.zeros(2)
-    lengths = spacing * np.array(height.shape[::-1])
-    return HeightMap(height, spacing, (float(middle[0] - lengths[0] / 2), float(middle[1] - lengths[1] / 2)))
+    data = read_arrays(path, (_LAYER, "resolution", "position"))
+    height, spacing = data[_LAYER], float(_numbers(data, "resolution", 1)[0])
+    x, y = _numbers(data, "position", 2) if "position" in data else np.zeros(2)
+    if height.ndim != 2:
+        raise ValueError(f"{_LAYER} has shape {list(height.shape)}")
+    rows, columns = height.shape
+    return HeightMap(height, spacing, (float(x) - spacing * columns / 2, float(y) - spacing * rows / 2))
+
+
+def _numbers(data: dict[str, np.ndarray], name: str, count: int) -> np.ndarray:
+    """So many numbers of a file that has to hold just them."""
+    if data[name].size != count or data[name].dtype.kind not in "iuf":
+        raise ValueError(f"{name} is no {'number' if count == 1 else f'list of {count} numbers'}")
+    return data[name].ravel().astype(float)
 
 
 def _npz(one: HeightMap) -> bytes:
@@ -254,12 +281,16 @@ def _saved(save: Callable[..., Any], **arrays: Any) -> bytes:
 
 
 def _read_png(path: Path) -> HeightMap:
-    from PIL import Image
-
-    with Image.open(path) as image:
-        told = json.loads(getattr(image, "text", {})[_CHUNK])
+    with picture(path) as image:
+        told = json.loads(getattr(image, "text", {}).get(_CHUNK, "null"))
         numbers = np.asarray(image, np.int64)[::-1]
-    spacing, lowest, step, x, y = (float(told[name]) for name in ("spacing", "lowest", "step", "x", "y"))
+    if told is None:
+        raise KeyError(_CHUNK)
+    for name in _TOLD:
+        value = told.get(name) if isinstance(told, dict) else None
+        if not isinstance(value, int | float) or not abs(value) <= _FAR:
+            raise ValueError(f"its text {_CHUNK} has {reprlib.repr(value)} as {name}")
+    spacing, lowest, step, x, y = (float(told[name]) for name in _TOLD)
     return HeightMap(np.where(numbers == 0, np.nan, lowest + (numbers - 1) * step), spacing, (x, y))
 
 

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any, BinaryIO, Literal, Protocol
 
 from jaxsand.cli.files import as_json, folder, progress, write_json
+from jaxsand.goals.untrusted import read_json
 from jaxsand.scene.progress import Tell
 from train.runs.checkpoints import At, State, described, restored, save, unwritable, where
 from train.runs.checkpoints import load as load_state
@@ -192,13 +193,13 @@ def seed_of(out: Path) -> int:
 def _config(out: Path) -> dict[str, Any]:
     """The configuration of the run in a folder."""
     path = out / _CONFIG
+    if not path.exists():
+        raise ValueError(f"run: there is none in {out}; train one: python -m train --help")
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"run: there is none in {out}; train one: python -m train --help") from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"run: cannot read {path} ({type(error).__name__}); train anew in another folder") from None
-    if not isinstance(config, dict) or not isinstance(config.get("seed"), int) or "learner" not in config:
+        config = read_json(path)
+    except ValueError as error:
+        raise ValueError(f"run: cannot read {path} ({error}); train anew in another folder") from None
+    if not isinstance(config, dict) or type(config.get("seed")) is not int or "learner" not in config:
         raise ValueError(f"run: {path} is no run's; it needs a learner and a seed; train anew in another folder")
     return config
 
