@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -76,19 +77,33 @@ def ended(work: Callable[[], None]) -> int:
     """The exit code of a command: 0, or what its mistakes, the keyboard and closed pipes end it with."""
     try:
         work()
+        sys.stdout.flush()
     except ValueError as error:
         return fail(str(error))
-    except RuntimeError as error:
-        if type(error).__name__ != "OutcomeError":
-            raise
-        return fail(f"outcome: {error}")
+    except (RuntimeError, MemoryError) as error:
+        if type(error).__name__ == "OutcomeError":
+            return fail(f"outcome: {error}")
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            return fail("memory: there is not enough; ask for less: a smaller map or batch, or fewer strokes")
+        raise
     except KeyboardInterrupt as error:
         print(str(error) or "stopped", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _print_nowhere()
         return 1
+    except OSError as error:
+        if error.filename is None:  # what is printed goes to a full disk
+            _print_nowhere()
+        file = "the output" if error.filename is None else f"{error.filename!s:.200}"
+        return fail(f"file: cannot use {file} ({error.strerror}); choose another, or make room")
     return 0
+
+
+def _print_nowhere() -> None:
+    """Has what is still to be printed thrown away, so that the program's end does not stumble over it."""
+    with suppress(OSError):  # it may be no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def fail(message: str) -> int:

@@ -22,10 +22,14 @@ def existing(path: Path, accepted: str = "") -> Path:
             f"{path}: {path.suffix or 'no suffix'} is not read; give a {accepted} file: heights [H, W] in metres, first row "
             "at y = 0, saved with numpy.save (from an .asc or .tif, whose first row is on top: after numpy.flipud)"
         )
-    if path.is_dir():
-        raise ValueError(f"{path}: is a folder; give a file")
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file; check the name")
+    try:
+        if path.is_dir():
+            raise ValueError(f"{path}: is a folder; give a file")
+        there = path.is_file()
+    except OSError:  # a name that is too long, or in a folder that may not be read
+        there = False
+    if not there:
+        raise ValueError(f"{path!s:.200}: no such file; check the name")
     return path
 
 

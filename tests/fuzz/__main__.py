@@ -19,14 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from .entrances import ENTRANCES
+from .entrances import ENTRANCES, LIMITS
 from .judge import Broken, judged
 
 
 def one(name: str, number: int, folder: Path, seed: int = 0) -> str:
     """Runs a case of an entrance in an empty folder; returns "ok" or what was said to be wrong. Broken if it is broken."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
-    return judged(ENTRANCES[name](rng, folder))
+    return judged(ENTRANCES[name](rng, folder), LIMITS.get(name, 10.0))
 
 
 def main() -> int:
@@ -59,10 +59,10 @@ def _entrance(name: str, options: argparse.Namespace) -> int:
         except Broken as error:
             place = traceback.extract_tb((error.__cause__ or error).__traceback__)
             ours = [f"{Path(f.filename).name}:{f.lineno}" for f in place if "jaxsand" in f.filename or "train/" in f.filename]
-            kind = f"{str(error).split(':')[0]} at {ours[-1] if ours else '?'}"
+            kind = f"{str(error).rpartition(']: ')[2]:.40} at {ours[-1] if ours else '?'}"
             kinds[kind] += 1
             if kinds[kind] == 1:
-                print(f"  {name} case {number}: {error!s:.200}  [{' < '.join(ours[:-4:-1])}]", flush=True)
+                print(f"  {name} case {number}: {error!s:.400}  [{' < '.join(ours[:-4:-1])}]", flush=True)
     faulthandler.cancel_dump_traceback_later()
     seconds = time.monotonic() - began
     print(f"{name}: {options.cases} cases, {good} taken, {kinds.total()} broken, {seconds:.1f} s", flush=True)

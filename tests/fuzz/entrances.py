@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from . import calls, commands
 from .files import FILES
 from .spoil import Rng
 
@@ -18,4 +19,12 @@ def file_case(name: str, rng: Rng, folder: Path) -> Callable[[], object]:
     return lambda: read(path)
 
 
-ENTRANCES: dict[str, Entrance] = {f"read-{name}": partial(file_case, name) for name in FILES}
+ENTRANCES: dict[str, Entrance] = {
+    **{f"read-{name}": partial(file_case, name) for name in FILES},
+    "command-jaxsand": partial(commands.case, "jaxsand", False),
+    "command-train": partial(commands.case, "train", False),
+    "command-heavy": partial(commands.case, "jaxsand", True),
+    **{f"call-{name}": partial(calls.case, name) for name in calls.CALLS},
+}
+LIMITS = {"command-heavy": 120.0, "command-train": 60.0, "call-step": 60.0, "call-make": 60.0}
+"""Seconds that a case may take, where they are not 10."""

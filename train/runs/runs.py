@@ -21,7 +21,7 @@ from types import FrameType
 from typing import Any, BinaryIO, Literal, Protocol
 
 from jaxsand.cli.files import as_json, folder, progress, write_json
-from jaxsand.goals.untrusted import read_json
+from jaxsand.goals.untrusted import read_json, reason
 from jaxsand.scene.progress import Tell
 from train.runs.checkpoints import At, State, described, restored, save, unwritable, where
 from train.runs.checkpoints import load as load_state
@@ -165,7 +165,12 @@ def load(out: Path, learner: Learner, which: Literal["best", "last"] = "best") -
     Raises:
       ValueError: if there is none, it cannot be read, or it is another learner's.
     """
-    return load_state(out / f"{which}.npz", learner.init(_config(out)["seed"]))[0]
+    seed = _config(out)["seed"]
+    try:
+        like = learner.init(seed)
+    except Exception as error:  # fields that another version, or another hand, wrote may break it anywhere
+        raise ValueError(f"run: cannot begin the learner in {out / _CONFIG} ({reason(error)}); train anew") from None
+    return load_state(out / f"{which}.npz", like)[0]
 
 
 def learner_of(out: Path) -> Learner:
