@@ -78,32 +78,35 @@ def ended(work: Callable[[], None]) -> int:
     try:
         work()
         sys.stdout.flush()
-    except ValueError as error:
-        return fail(str(error))
-    except (RuntimeError, MemoryError) as error:
-        if type(error).__name__ == "OutcomeError":
-            return fail(f"outcome: {error}")
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-            return fail("memory: there is not enough; ask for less: a smaller map or batch, or fewer strokes")
-        raise
     except KeyboardInterrupt as error:
         print(str(error) or "stopped", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        _print_nowhere()
-        return 1
-    except OSError as error:
-        if error.filename is None:  # what is printed goes to a full disk
-            _print_nowhere()
-        file = "the output" if error.filename is None else f"{error.filename!s:.200}"
-        return fail(f"file: cannot use {file} ({error.strerror}); choose another, or make room")
+    except Exception as error:
+        mistake = _mistake(error)
+        if isinstance(error, OSError) and error.filename is None:  # what is printed cannot be: it need not be at the end
+            with suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return 1
+        if mistake is None:
+            raise
+        return fail(mistake)
     return 0
 
 
-def _print_nowhere() -> None:
-    """Has what is still to be printed thrown away, so that the program's end does not stumble over it."""
-    with suppress(OSError):  # it may be no file
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _mistake(error: Exception) -> str | None:
+    """What an error says to a user; None for what is a fault of the program's own."""
+    match error:
+        case ValueError():
+            return str(error)
+        case OSError():
+            file = "the output" if error.filename is None else f"{error.filename!s:.200}"
+            return f"file: cannot use {file} ({error.strerror}); choose another, or make room"
+        case RuntimeError() if type(error).__name__ == "OutcomeError":
+            return f"outcome: {error}"
+        case RuntimeError() | MemoryError() if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            return "memory: there is not enough; ask for less: a smaller map or batch, or fewer strokes"
+    return None
 
 
 def fail(message: str) -> int:

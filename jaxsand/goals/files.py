@@ -6,6 +6,7 @@ sign for cells without data; `read_map` and `write_map` say which.
 
 import json
 import math
+import os
 import reprlib
 import struct
 from collections.abc import Callable
@@ -18,12 +19,13 @@ import numpy as np
 from jaxsand.goals.letters import picture
 from jaxsand.goals.untrusted import read_array, read_arrays, reason
 from jaxsand.scene.masked import gaps
+from jaxsand.scene.validation import finite, positive, short
 
 _NO_DATA = -9999.0  # in .asc files that are written
 _LAYER = "elevation"
 _CHUNK = "jaxsand"  # the text of a PNG that holds spacing, lowest height and step
 _TOLD = ("spacing", "lowest", "step", "x", "y")  # what it holds
-_FAR = 1e12  # m: what it may hold
+_FAR = 1e12  # m: what a map, its spacing and its corner stay within, so that formats of float32 hold them
 _MOST = 2**28  # cells of a map that is read
 _HEAD = 20  # lines of an .asc file's header
 _AGAIN = "write it anew with write_map, or check that its suffix says what it is"
@@ -50,15 +52,26 @@ class HeightMap:
     corner: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        height = np.asarray(gaps(self.height))
+        try:
+            height = np.asarray(gaps(self.height))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"height: got no array ({reason(error)}); give a map [H, W] in metres") from None
         if height.ndim != 2 or not height.size or height.dtype.kind not in "fiu":
             raise ValueError(f"height: got {height.dtype} of shape {list(height.shape)}; give a map [H, W] in metres")
         if np.isinf(height).any():
             raise ValueError("height: got cells that are infinite; give NaN where nothing is known")
-        if not (math.isfinite(self.spacing) and self.spacing > 0):
-            raise ValueError(f"spacing: got {self.spacing}; give metres, above 0")
-        if not all(map(math.isfinite, self.corner)):
-            raise ValueError(f"corner: got {self.corner}; give x and y in metres")
+        if np.abs(height).max(initial=0, where=~np.isnan(height)) > _FAR:
+            raise ValueError(f"height: got cells more than {_FAR:g} m from 0; give metres, and NaN where nothing is known")
+        positive("spacing", self.spacing, "give metres")
+        if np.shape(self.corner) != (2,):
+            raise ValueError(f"corner: got {short(self.corner)}; give x and y in metres")
+        for number in self.corner:
+            finite("corner", number, "give x and y in metres")
+        spacing, corner = float(self.spacing), (float(self.corner[0]), float(self.corner[1]))
+        if max(spacing, *map(abs, corner)) > _FAR:
+            raise ValueError(f"spacing: got {spacing:g} with corner {corner}; give metres, at most {_FAR:g}")
+        object.__setattr__(self, "spacing", spacing)
+        object.__setattr__(self, "corner", corner)
         object.__setattr__(self, "height", height if height.dtype.kind == "f" else height.astype(np.float64))
 
 
@@ -91,7 +104,7 @@ def read_map(path: str | Path, *, spacing: float | None = None) -> HeightMap:
       >>> js.read_map(path).height
       array([[0.25,  nan]])
     """
-    path = Path(path)
+    path = _path(path)
     readers: dict[str, Callable[[Path], HeightMap]] = {".asc": _read_asc, ".npz": _read_npz, ".png": _read_png}
     suffix = path.suffix.lower()
     if suffix != ".npy" and suffix not in readers:
@@ -142,7 +155,7 @@ def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: floa
       >>> path.read_text().splitlines()[-1]
       '0.0 0.1'
     """
-    path = Path(path)
+    path = _path(path)
     one = _as_map(height, spacing)
     writers: dict[str, Callable[[HeightMap], bytes]] = {
         ".asc": _asc,
@@ -187,6 +200,12 @@ def hfield_size(height: HeightMap | np.ndarray, *, spacing: float | None = None)
     rows, columns = one.height.shape
     high = float(np.ptp(one.height)) or 1e-6  # a level map has no range to scale
     return (columns - 1) * one.spacing / 2, (rows - 1) * one.spacing / 2, high, _base(one)
+
+
+def _path(path: str | Path) -> Path:
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path: got {short(path)}; give the name of a file")
+    return Path(path)
 
 
 def _as_map(height: HeightMap | np.ndarray, spacing: float | None) -> HeightMap:

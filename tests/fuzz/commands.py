@@ -16,7 +16,27 @@ from .files import DRAWING, FILES, GLYPHS, MAP, METRICS, config, state
 from .spoil import TEXTS, Rng, pick
 
 LINE = re.compile(r"error: \S[^:]*: \S.*; \S.*\n")
-ODD = (*TEXTS, " ", "-", "é", "\udc80", "../../x", "/", ".", "x" * 300, "x" * 300 + ".npy", "x" * 300 + ".json", "x" * 300 + ".txt", "a\nb", "#.S", "'", "0,0", "-1,5", "1,1,1", "a" * 5000)
+ODD = (
+    *TEXTS,
+    " ",
+    "-",
+    "é",
+    "\udc80",
+    "../../x",
+    "/",
+    ".",
+    "x" * 300,
+    "x" * 300 + ".npy",
+    "x" * 300 + ".json",
+    "x" * 300 + ".txt",
+    "a\nb",
+    "#.S",
+    "'",
+    "0,0",
+    "-1,5",
+    "1,1,1",
+    "a" * 5000,
+)
 VALUES = {
     "start": ("0,0", "1,1", "best"),
     "end": ("2,2",),
@@ -42,11 +62,24 @@ VALUES = {
     "bound": ("10",),
     "relief-mm": ("10",),
 }
-GOALS = ("S", "L", "good.txt", "x.txt", "flat.npy", "x.npy", "white.png", "x.png", "good.json", "x.json", "terrain", "no.npy")
+GOALS = (
+    "S",
+    "L",
+    "good.txt",
+    "x.txt",
+    "flat.npy",
+    "x.npy",
+    "white.png",
+    "x.png",
+    "good.json",
+    "x.json",
+    "terrain",
+    "no.npy",
+)
 MAPS = ("S", "good.txt", "x.txt", "no.txt")
 
 
-class Crash(Exception):
+class CrashError(Exception):
     """A command did what it must not do."""
 
 
@@ -142,7 +175,7 @@ STUBS = (
 
 
 def run(main: Main, words: list[str], folder: Path, stubs: tuple[str, ...]) -> None:
-    """Runs a command, and judges its exit code, what it printed and what it left; Crash if anything is amiss."""
+    """Runs a command, and judges its exit code, what it printed and what it left; CrashError if anything is amiss."""
     out, err = io.TextIOWrapper(io.BytesIO(), "utf-8"), io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace")
     before = contents(folder)
     with ExitStack() as all_of_them:
@@ -157,19 +190,19 @@ def run(main: Main, words: list[str], folder: Path, stubs: tuple[str, ...]) -> N
         except SystemExit as end:
             code = end.code
         except Exception as error:
-            raise Crash(f"{words}: {type(error).__name__}: {error}") from error
+            raise CrashError(f"{words}: {type(error).__name__}: {error}") from error
     said, told = text(out), text(err)
     if code == 2 and (said or told.count("\n") != 1 or not LINE.fullmatch(told)):
-        raise Crash(f"{words}: not one line of field, fault and remedy: {said!r:.100} {told!r:.400}")
+        raise CrashError(f"{words}: not one line of field, fault and remedy: {said!r:.100} {told!r:.400}")
     if code not in (0, 2):
-        raise Crash(f"{words}: ended with {code}: {told!r:.300}")
+        raise CrashError(f"{words}: ended with {code}: {told!r:.300}")
     if code == 0 and "--json" in words:
         json.loads(said)
     left = {path: data for path, data in contents(folder).items() if before.get(path) != data}
     for path, data in left.items():
         whole(path, data, words)
     if code == 2 and left:
-        raise Crash(f"{words}: failed, and left {sorted(map(str, left))}: {told!r:.200}")
+        raise CrashError(f"{words}: failed, and left {sorted(map(str, left))}: {told!r:.200}")
 
 
 def text(stream: io.TextIOWrapper) -> str:
@@ -184,9 +217,9 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def whole(path: Path, data: bytes, words: list[str]) -> None:
-    """Crash if a file that a command left is not whole."""
+    """CrashError if a file that a command left is not whole."""
     if path.name.startswith(".") or path.suffix == ".part":
-        raise Crash(f"{words}: left {path.name}")
+        raise CrashError(f"{words}: left {path.name}")
     if path.suffix == ".json":
         json.loads(data)
     elif path.suffix == ".npy":

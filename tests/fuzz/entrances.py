@@ -26,5 +26,5 @@ ENTRANCES: dict[str, Entrance] = {
     "command-heavy": partial(commands.case, "jaxsand", True),
     **{f"call-{name}": partial(calls.case, name) for name in calls.CALLS},
 }
-LIMITS = {"command-heavy": 120.0, "command-train": 60.0, "call-step": 60.0, "call-make": 60.0}
+LIMITS = {name: 120.0 if name == "command-heavy" else 60.0 for name in ENTRANCES if not name.startswith("read-")}
 """Seconds that a case may take, where they are not 10."""

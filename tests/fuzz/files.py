@@ -13,7 +13,7 @@ import numpy as np
 
 import jaxsand as js
 
-from .spoil import NUMBERS, WORDS, Rng, array, as_json, pick, spoilt, spoilt_bytes, spoilt_words, value
+from .spoil import Rng, array, as_json, pick, spoilt, spoilt_bytes, spoilt_words
 
 Reader = Callable[[Path], object]
 Maker = Callable[[Rng], bytes]
@@ -23,7 +23,12 @@ PIT = {"kind": "rectangle", "centre": [0.12, 0.12], "size": [0.12, 0.08], "heigh
 DRAWING = {
     "shapes": [
         PIT,
-        {"kind": "polygon", "points": [[0, 0], [0.1, 0], [0.1, 0.2]], "holes": [[[0.01, 0], [0.02, 0], [0, 0.1]]], "free": True},
+        {
+            "kind": "polygon",
+            "points": [[0, 0], [0.1, 0], [0.1, 0.2]],
+            "holes": [[[0.01, 0], [0.02, 0], [0, 0.1]]],
+            "free": True,
+        },
         {"kind": "disc", "centre": [0.1, 0.1], "radius": 0.05, "inner": 0.01, "height": 0.01, "above": 2.0},
         {"kind": "path", "points": [[0.01, 0.02], [0.2, 0.1]], "width": 0.04, "height": -0.01},
         {"kind": "text", "text": "S", "corner": [0.05, 0.05], "size": 0.1, "width": 0.03, "height": -0.01},
@@ -39,7 +44,10 @@ CONFIG: dict[str, object] = {
     "seed": 3,
     "versions": {"jax": "1"},
 }
-METRICS = [{"kind": "train", "chunk": 1, "seconds": 0.5, "steps": 64}, {"kind": "validate", "chunk": 1, "seconds": 1.0, "score": 0.5}]
+METRICS = [
+    {"kind": "train", "chunk": 1, "seconds": 0.5, "steps": 64},
+    {"kind": "validate", "chunk": 1, "seconds": 1.0, "score": 0.5},
+]
 ASC = "ncols 3\nnrows 2\nxllcorner 0\nyllcenter 0.5\ncellsize 0.5\nNODATA_value -1\n0.25 -1 0\n1 2 3\n"
 MAP = "# a map\n#..\n#S.\n###\n"
 

@@ -6,27 +6,28 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from typing import Literal
 
 NAMED = re.compile(r"^\S.{0,400}?: \S")  # what is wrong, and how
 
 
-class Hang(BaseException):
+class HangError(BaseException):
     """A case took too long; no `except Exception` stops it."""
 
 
-class Broken(AssertionError):
+class BrokenError(AssertionError):
     """A case did what no input may make it do."""
 
 
 @contextlib.contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Raises Hang where the work takes longer; a thread other than the main one cannot be stopped, and is not."""
+    """Raises HangError where the work takes longer; a thread other than the main one cannot be stopped, and is not."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def late(*_: object) -> None:
-        raise Hang(f"not done after {seconds:g} s")
+        raise HangError(f"not done after {seconds:g} s")
 
     before = signal.signal(signal.SIGALRM, late)
     signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -37,23 +38,23 @@ def within(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def judged(run: Callable[[], object], seconds: float = 10.0) -> str:
+def judged(run: Callable[[], object], seconds: float = 10.0, warned: Literal["error", "ignore"] = "error") -> str:
     """Runs a case; returns "ok" or what it said was wrong.
 
     Raises:
-      Broken: for any other exception, a warning, a message that is not one line or names nothing, and a hang.
+      BrokenError: for any other exception, a warning, a message that is not one line or names nothing, and a hang.
     """
     try:
         with warnings.catch_warnings(), within(seconds):
-            warnings.simplefilter("error")
+            warnings.simplefilter(warned)
             run()
     except ValueError as error:
         said = str(error)
         if type(error) is not ValueError:
-            raise Broken(f"{type(error).__name__}: {said:.300}") from error
+            raise BrokenError(f"{type(error).__name__}: {said:.300}") from error
         if len(said.splitlines()) != 1 or len(said) > 1000 or not NAMED.match(said):
-            raise Broken(f"a message that is no line, or names nothing: {said[:300]!r}") from error
+            raise BrokenError(f"a message that is no line, or names nothing: {said[:300]!r}") from error
         return said
-    except (Exception, Hang) as error:
-        raise Broken(f"{type(error).__name__}: {error!s:.300}") from error
+    except (Exception, HangError) as error:
+        raise BrokenError(f"{type(error).__name__}: {error!s:.300}") from error
     return "ok"

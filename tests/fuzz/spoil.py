@@ -9,8 +9,41 @@ import numpy as np
 Rng = np.random.Generator
 
 WORDS = ("", " ", "nan", "-", "--", "\0", "é", "🏖", "\ud800", "../../x", "/", ".", "x" * 300, "a\nb", "1e999", "٣", "#.S")
-NUMBERS = (0, -0.0, 1, -1, 2, 0.5, 1e-300, 1e308, -1e308, 1e39, math.nan, math.inf, -math.inf, 2**31, 2**63, -(2**63) - 1, 10**400)
-TEXTS = ("0", "-1", "1e999", "nan", "inf", "-9999", "99999999999999999999", "1" * 5000, "0x10", "1_0", "", "x", "1e-320", "٣")
+NUMBERS = (
+    0,
+    -0.0,
+    1,
+    -1,
+    2,
+    0.5,
+    1e-300,
+    1e308,
+    -1e308,
+    1e39,
+    math.nan,
+    math.inf,
+    -math.inf,
+    2**31,
+    2**63,
+    -(2**63) - 1,
+    10**400,
+)
+TEXTS = (
+    "0",
+    "-1",
+    "1e999",
+    "nan",
+    "inf",
+    "-9999",
+    "99999999999999999999",
+    "1" * 5000,
+    "0x10",
+    "1_0",
+    "",
+    "x",
+    "1e-320",
+    "٣",
+)
 
 
 def pick(rng: Rng, some: Any) -> Any:
@@ -108,8 +141,7 @@ def array(rng: Rng) -> np.ndarray:
     if rng.random() < 0.5 and some.size:
         some = np.where(rng.random(shape) < 0.1, pick(rng, (math.nan, math.inf, -9999, 1e300)), some)
     if rng.random() < 0.1:
-        record = np.zeros(shape, [("a", "f4"), ("b", "i2")])
-        return record
+        return np.zeros(shape, [("a", "f4"), ("b", "i2")])
     with np.errstate(all="ignore"):
         plain = some if np.dtype(dtype).kind in "fcUS" else np.clip(np.nan_to_num(some), 0, 100)
         return np.zeros(shape, dtype) if np.dtype(dtype).kind == "V" else plain.astype(dtype)

@@ -154,7 +154,9 @@ def restored(data: Any) -> Any:
     except ModuleNotFoundError as error:
         raise ValueError(f"config: {data['is']} needs {error.name}; run pip install 'jaxsand[train]'") from None
     except (ImportError, AttributeError, TypeError) as error:
-        raise ValueError(f"config: cannot make {data['is']} ({error!s:.200}); use the version that the run was made with") from None
+        raise ValueError(
+            f"config: cannot make {data['is']} ({error!s:.200}); use the version that the run was made with"
+        ) from None
 
 
 def _named(state: State) -> dict[str, Any]:

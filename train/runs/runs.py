@@ -6,7 +6,6 @@ RUN/last.npz       the state to go on from
 RUN/best.npz       the state that validated best
 """
 
-import json
 import os
 import platform
 import signal

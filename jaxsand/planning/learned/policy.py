@@ -95,7 +95,9 @@ def in_batches(
 
 
 @partial(jax.jit, static_argnames=("net", "count"))
-def _proposed(net: StrokeNet, params: Params, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _proposed(
+    net: StrokeNet, params: Params, count: int, goal: jax.Array, current: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """The `count` likeliest strokes [B, count, 4] (cells) and their scores [B, count]."""
     return likeliest(judge(net, params), symmetric(net, params, goal, current), count)
 
