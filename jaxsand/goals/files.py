@@ -63,11 +63,13 @@ class HeightMap:
         if np.abs(height).max(initial=0, where=~np.isnan(height)) > _FAR:
             raise ValueError(f"height: got cells more than {_FAR:g} m from 0; give metres, and NaN where nothing is known")
         positive("spacing", self.spacing, "give metres")
-        if np.shape(self.corner) != (2,):
-            raise ValueError(f"corner: got {short(self.corner)}; give x and y in metres")
-        for number in self.corner:
+        try:
+            x, y = self.corner
+        except (TypeError, ValueError):
+            raise ValueError(f"corner: got {short(self.corner)}; give x and y in metres") from None
+        for number in (x, y):
             finite("corner", number, "give x and y in metres")
-        spacing, corner = float(self.spacing), (float(self.corner[0]), float(self.corner[1]))
+        spacing, corner = float(self.spacing), (float(x), float(y))
         if max(spacing, *map(abs, corner)) > _FAR:
             raise ValueError(f"spacing: got {spacing:g} with corner {corner}; give metres, at most {_FAR:g}")
         object.__setattr__(self, "spacing", spacing)

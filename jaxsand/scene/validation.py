@@ -39,7 +39,8 @@ def finite(name: str, value: object, remedy: str) -> None:
 
 def short(value: Any) -> str:
     """A value as messages show it, on a line: a number as it is, of an array its shape, of anything else its beginning."""
-    if hasattr(value, "dtype") and getattr(value, "shape", ()):
-        return f"an array of shape {list(value.shape)}"
+    shape: tuple[int, ...] = getattr(value, "shape", ()) if hasattr(value, "dtype") else ()
+    if shape:
+        return f"an array of shape {list(shape)}"
     said = " ".join(repr(value).split())
     return said if len(said) <= _LONGEST else said[: _LONGEST - 3] + "..."

@@ -17,6 +17,7 @@ N = 8
 LEVEL = np.zeros((N, N), np.float32)
 SAND = js.make_scene((N, N), 0.01, tool=js.Blade())
 SOLID = np.eye(N, dtype=bool)
+MASKED = np.ma.masked_array(LEVEL, SOLID)
 QUICK = {"stop": js.Sweeps(2), "push": js.SteppedPush(1.0, 1)}
 STROKE = (0.02, 0.02, 0.05, 0.05)
 MAP = np.ones((3, 3), bool)
@@ -24,27 +25,21 @@ MAP = np.ones((3, 3), bool)
 
 def odd(rng: Rng) -> Any:
     """Anything that someone may give by mistake."""
-    kind = int(rng.integers(9))
-    if kind < 2:
-        return pick(rng, NUMBERS)
-    if kind == 2:
-        return pick(rng, WORDS)
-    if kind == 3:
-        return array(rng)
-    if kind == 4:
-        return pick(rng, (None, True, False, [], (), {}, object(), 1j, {"a": 1}, [[1, 2], [3]], datetime.date(2020, 1, 1)))
-    if kind == 5:
-        masked = np.ma.masked_array(LEVEL, np.eye(N))
-        return pick(rng, (masked, np.ma.masked, jnp.zeros(3), np.float16(2), np.int64(-1), jnp.float32(jnp.nan)))
-    if kind == 6:
-        return pick(
+    far = 10.0 ** float(rng.integers(-3, 37))
+    makers: tuple[Callable[[], Any], ...] = (
+        lambda: pick(rng, NUMBERS),
+        lambda: pick(rng, NUMBERS),
+        lambda: pick(rng, WORDS),
+        lambda: pick(rng, (None, True, False, [], (), {}, object(), 1j, {"a": 1}, [[1, 2], [3]], datetime.date(2020, 1, 1))),
+        lambda: pick(rng, (MASKED, np.ma.masked, jnp.zeros(3), np.float16(2), np.int64(-1), jnp.float32(jnp.nan))),
+        lambda: pick(
             rng, (js.Blade, js.Blade(), js.NoTool(), js.Walls(SOLID), js.Whole(), js.Sweeps(2), SAND, js.Deep(), int)
-        )
-    if kind == 7:
-        return field(rng)
-    return (rng.normal(size=pick(rng, ((4,), (6,), (2, 3), (N, N)))) * 10.0 ** float(rng.integers(-3, 37))).astype(
-        np.float32
+        ),
+        lambda: array(rng),
+        lambda: field(rng),
+        lambda: (rng.normal(size=pick(rng, ((4,), (6,), (2, 3), (N, N)))) * far).astype(np.float32),
     )
+    return pick(rng, makers)()
 
 
 def field(rng: Rng) -> Any:

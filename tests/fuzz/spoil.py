@@ -73,17 +73,17 @@ def spoilt(rng: Rng, thing: Any) -> Any:
         return value(rng)
     if isinstance(thing, dict):
         key = pick(rng, sorted(thing))
-        if rng.random() < 0.15:
-            return {k: v for k, v in thing.items() if k != key}
-        if rng.random() < 0.1:
-            return thing | {str(pick(rng, WORDS)): value(rng)}
-        return thing | {key: spoilt(rng, thing[key])}
+        less = {k: v for k, v in thing.items() if k != key}
+        more = thing | {str(pick(rng, WORDS)): value(rng)}
+        return _one(rng, less, more, thing | {key: spoilt(rng, thing[key])})
     at = int(rng.integers(len(thing)))
-    if rng.random() < 0.15:
-        return thing[:at] + thing[at + 1 :]
-    if rng.random() < 0.1:
-        return thing[:at] + [thing[at]] * int(rng.integers(1, 5)) + thing[at:]
-    return [*thing[:at], spoilt(rng, thing[at]), *thing[at + 1 :]]
+    less, more = thing[:at] + thing[at + 1 :], thing[:at] + [thing[at]] * int(rng.integers(1, 5)) + thing[at:]
+    return _one(rng, less, more, [*thing[:at], spoilt(rng, thing[at]), *thing[at + 1 :]])
+
+
+def _one(rng: Rng, less: Any, more: Any, other: Any) -> Any:
+    """One of the three, mostly the last."""
+    return less if rng.random() < 0.15 else more if rng.random() < 0.1 else other
 
 
 def as_json(rng: Rng, thing: Any) -> bytes:
