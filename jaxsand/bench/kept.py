@@ -7,10 +7,19 @@ from jaxsand.bench.tables import Row
 
 
 def append_row(path: Path, row: Row) -> None:
-    """Adds a row to a file, on a line of its own even if the last line was cut off."""
-    cut = path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n")
-    with path.open("a", encoding="utf-8") as file:
-        file.write("\n" * cut + json.dumps(row) + "\n")
+    """Adds a row to a file, on a line of its own even if the last line was cut off.
+
+    Raises:
+      ValueError: if it cannot be written; the rows that are there stay.
+    """
+    try:
+        cut = path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n")
+        with path.open("a", encoding="utf-8") as file:
+            file.write("\n" * cut + json.dumps(row) + "\n")
+    except OSError as error:
+        raise ValueError(
+            f"out: cannot write {path} ({error.strerror}); make room or choose another folder: the rows there stay good"
+        ) from None
 
 
 def known_rows(path: Path, names: set[str]) -> list[Row]:
