@@ -60,7 +60,7 @@ class HeightMap:
             raise ValueError(f"height: got {height.dtype} of shape {list(height.shape)}; give a map [H, W] in metres")
         if np.isinf(height).any():
             raise ValueError("height: got cells that are infinite; give NaN where nothing is known")
-        if np.abs(height).max(initial=0, where=~np.isnan(height)) > _FAR:
+        if float(np.abs(height).max(initial=0, where=~np.isnan(height))) > _FAR:
             raise ValueError(f"height: got cells more than {_FAR:g} m from 0; give metres, and NaN where nothing is known")
         positive("spacing", self.spacing, "give metres")
         try:
