@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxsand.cli.arguments import Parser, ended, path_name
-from jaxsand.cli.files import existing, written
+from jaxsand.cli.files import existing
+from jaxsand.goals.writing import written
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

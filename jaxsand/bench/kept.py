@@ -1,6 +1,8 @@
 """Rows of a bench that are kept in a file as they come, so that a run that was cut off goes on where it stopped."""
 
+import errno
 import json
+import os
 from pathlib import Path
 
 from jaxsand.bench.tables import Row
@@ -14,8 +16,10 @@ def append_row(path: Path, row: Row) -> None:
     """
     try:
         cut = path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n")
-        with path.open("a", encoding="utf-8") as file:
-            file.write("\n" * cut + json.dumps(row) + "\n")
+        data = ("\n" * cut + json.dumps(row) + "\n").encode()
+        with path.open("ab", buffering=0) as file:  # in one piece, beside those of another bench
+            if file.write(data) != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError as error:
         raise ValueError(
             f"out: cannot write {path} ({error.strerror}); make room or choose another folder: the rows there stay good"

@@ -4,10 +4,10 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from jaxsand.goals.writing import written
 
 if TYPE_CHECKING:
     import numpy as np
@@ -65,19 +65,6 @@ def folder(path: Path) -> Path:
     except OSError as error:
         raise ValueError(f"out: cannot write to {path} ({error.strerror}); choose another folder") from None
     return path
-
-
-@contextmanager
-def written(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write to, which takes its place when all went well."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        yield beside
-        beside.replace(path)
-    except OSError as error:
-        raise ValueError(f"out: cannot write {path} ({error.strerror}); choose another folder") from None
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def progress() -> "Tell":

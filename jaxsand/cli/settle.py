@@ -5,8 +5,9 @@ import math
 import sys
 import time
 
-from jaxsand.cli.files import existing, folder, plausible, progress, written
+from jaxsand.cli.files import existing, folder, plausible, progress
 from jaxsand.cli.printing import lines, show
+from jaxsand.goals.writing import written
 
 SCHEMES = ("relaxation", "pairwise", "super-time-stepping", "multilevel")
 _TALLEST = 10  # times a map's side: what is higher or lower than that is no sand

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxsand.goals.letters import picture
-from jaxsand.goals.untrusted import read_array, read_arrays, reason
+from jaxsand.goals.untrusted import read_array, read_arrays
+from jaxsand.goals.writing import reason, written
 from jaxsand.scene.masked import gaps
 from jaxsand.scene.validation import finite, positive, short
 
@@ -145,7 +146,8 @@ def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: floa
       spacing: of the grid (m); for a map that is no `HeightMap`.
 
     Raises:
-      ValueError: for another suffix, gaps where a format has none, and as of `HeightMap`.
+      ValueError: for another suffix, gaps where a format has none, a file that cannot be written (what was there stays),
+        and as of `HeightMap`.
 
     Example:
       >>> import tempfile
@@ -173,7 +175,9 @@ def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: floa
         raise ValueError(f"{path}: {suffix or 'no suffix'} is not written; give one of {', '.join(writers)}")
     if suffix in (".stl", ".hfield") and np.isnan(one.height).any():
         raise ValueError(f"height: got cells without data, which {suffix} files cannot have; fill them, or write a .ply")
-    path.write_bytes(writers[suffix](one))
+    data = writers[suffix](one)
+    with written(path, "path") as beside:
+        beside.write_bytes(data)
 
 
 def hfield_size(height: HeightMap | np.ndarray, *, spacing: float | None = None) -> tuple[float, float, float, float]:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxsand.goals.untrusted import MOST_CELLS, read_array, reason
+from jaxsand.goals.untrusted import MOST_CELLS, read_array
+from jaxsand.goals.writing import reason
 from jaxsand.scene.masked import POINTS, gaps, unmasked
 
 if TYPE_CHECKING:

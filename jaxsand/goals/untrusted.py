@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.lib.npyio import NpzFile
 
+from jaxsand.goals.writing import reason
+
 MOST_JSON = 2**24
 """Bytes of JSON that are read."""
 
@@ -95,9 +97,3 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
         raise ValueError(f"{twice!r:.40} is given twice")
     return found
-
-
-def reason(error: BaseException) -> str:
-    """What an error says, in a few words on a line."""
-    said = getattr(error, "strerror", None) or str(error.args[0] if isinstance(error, KeyError) and error.args else error)
-    return " ".join(said.split())[:80] or type(error).__name__

@@ -318,7 +318,7 @@ def test_help_does_not_import_jax():
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
-    from jaxsand.cli.files import written
+    from jaxsand.goals.writing import written
 
     target = tmp_path / "result.json"
     target.write_text("old")

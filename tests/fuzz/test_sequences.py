@@ -71,7 +71,9 @@ class Sand(RuleBasedStateMachine):
             "edge": js.Draining(level * spacing) if g.drains else None,
         }
         blade = js.Blade(3 * spacing, 2 * spacing, spacing, yaw=g.yaw)
-        bucket = js.Bucket(3 * spacing, 2 * spacing, 4 * spacing**3, spacing, walls=1.5 * spacing if g.bucket_walls else None)
+        bucket = js.Bucket(
+            3 * spacing, 2 * spacing, 4 * spacing**3, spacing, walls=1.5 * spacing if g.bucket_walls else None
+        )
         tools = {"blade": blade, "wheel": js.Wheel(4 * spacing, 3 * spacing, spacing, 0.3), "bucket": bucket}
         self.scenes = {
             name: js.make_scene((N, N), spacing, angle, tool=tool, **grounds, **g.options) for name, tool in tools.items()
@@ -153,8 +155,12 @@ class Sand(RuleBasedStateMachine):
         act, before = (js.deposit if down else js.remove), self.height
         where = jnp.asarray([x * self.dx, y * self.dx], self.ground.dtype)
         out = act(self.scenes["blade"], self.height, where, volume * self.dx**3)
-        moved = self.dx**2 * (np.asarray(out.height, float) - np.asarray(before, float))[~self.solid].sum() + float(out.drained)
-        assert 0 <= moved * (1 if down else -1) + self.ground.most() * self.scale <= volume * self.dx**3 * 1.00001 + self.scale
+        moved = self.dx**2 * (np.asarray(out.height, float) - np.asarray(before, float))[~self.solid].sum() + float(
+            out.drained
+        )
+        assert (
+            0 <= moved * (1 if down else -1) + self.ground.most() * self.scale <= volume * self.dx**3 * 1.00001 + self.scale
+        )
         if not int(out.outcome) & js.Outcome.NOT_POURED:
             assert abs(abs(moved) - volume * self.dx**3) <= self.ground.most() * (self.scale + volume * self.dx**3)
         self.total += moved
@@ -222,7 +228,9 @@ def environment():
     """A small environment, with its step, and its reward's derivative by the action, compiled."""
     scene = js.make_scene((N, N), 0.01, tool=js.Blade(0.03, 0.015, 0.006))
     goal = jnp.zeros((1, N, N), jnp.float32).at[0, 4:8, 4:8].set(-0.004)
-    env, params = js.make("multi-stroke", goals=LevelGoals(goal), scene=scene, push=js.SwathPush(), settle=js.Sweeps(4), limit=4)
+    env, params = js.make(
+        "multi-stroke", goals=LevelGoals(goal), scene=scene, push=js.SwathPush(), settle=js.Sweeps(4), limit=4
+    )
     if not BUILT:
         BUILT.append(jax.jit(env.step))
         BUILT.append(jax.jit(jax.grad(lambda key, state, action, params: env.step(key, state, action, params)[2], 2)))

@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsand.goals.untrusted import read_arrays, reason
+from jaxsand.goals.untrusted import read_arrays
+from jaxsand.goals.writing import reason
 
 State = Any
 """A pytree of arrays (typed keys too): parameters, optimiser, buffer, environments, key, counters; everything."""

@@ -12,7 +12,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -20,7 +20,8 @@ from types import FrameType
 from typing import Any, BinaryIO, Literal, Protocol
 
 from jaxsand.cli.files import as_json, folder, progress, write_json
-from jaxsand.goals.untrusted import read_json, reason
+from jaxsand.goals.untrusted import read_json
+from jaxsand.goals.writing import reason
 from jaxsand.scene.progress import Tell
 from train.runs.checkpoints import At, State, described, restored, save, unwritable, where
 from train.runs.checkpoints import load as load_state
@@ -110,13 +111,16 @@ def run(
         raise ValueError("minutes: got none, and no steps; give one of them")
     tell = tell or progress()
     began = time.monotonic()
-    state, at = _begin(learner, out, seed, resume)
-    started = began - at.seconds
+    there = _check_there(out, resume)
+    with ExitStack() as held:
+        held.enter_context(_alone(out))
+        state, at = _begin(learner, out, seed, there)
+        rows, asked = held.enter_context(_rows(out, at.rows)), held.enter_context(_asked_to_stop())
+        started = began - at.seconds
 
-    def spent() -> float:
-        return time.monotonic() - started
+        def spent() -> float:
+            return time.monotonic() - started
 
-    with _rows(out, at.rows) as rows, _asked_to_stop() as asked:
         chunk, best = at.chunk, at.score
         score: float | None = None
         begun, first, saved = spent(), chunk, time.monotonic()
@@ -208,14 +212,40 @@ def _config(out: Path) -> dict[str, Any]:
     return config
 
 
-def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State, At]:
-    """The state to go on from, and where the run is."""
+def _check_there(out: Path, resume: bool) -> bool:
+    """Whether a run is in the folder, which can be written to; raises ValueError where `resume` does not go with that."""
     there = (out / _CONFIG).exists()
     if there and not resume:
         raise ValueError(f"out: there is a run in {out}; go on with --resume, or choose another folder")
     if resume and not there:
         raise ValueError(f"out: there is no run in {out} to go on with; leave --resume out, or check the name")
     folder(out)
+    return there
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Keeps other runs out of the folder, where the system can; raises ValueError if one is going on there."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    number = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"out: a run is going on in {out}; wait for its end, or choose another folder") from None
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(number)
+
+
+def _begin(learner: Learner, out: Path, seed: int, there: bool) -> tuple[State, At]:
+    """The state to go on from, and where the run is."""
     if there:
         _compare(_config(out), described(learner), seed, out)
     if not (out / _LAST).exists() and (out / _BEST).exists():

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from jaxsand.goals.untrusted import read_arrays, reason
+from jaxsand.goals.untrusted import read_arrays
+from jaxsand.goals.writing import reason
 from jaxsand.planning.learned.network import Params, StrokeNet, judge, likeliest, symmetric
 from jaxsand.scene.scene import Scene, blade_of
 
