@@ -96,7 +96,8 @@ def read_map(path: str | Path, *, spacing: float | None = None) -> HeightMap:
       The `HeightMap`: float64 from text and pictures, else as it was saved.
 
     Raises:
-      ValueError: for a file that cannot be read so, or a spacing that is missing or has no effect.
+      ValueError: for a file that cannot be read so, holds pickles, or would unpack to more than 2^26 cells and its own size;
+        for a spacing that is missing or has no effect.
 
     Example:
       >>> import tempfile
