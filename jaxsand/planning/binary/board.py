@@ -110,8 +110,9 @@ def make_problem(dig: ArrayLike, start: ArrayLike | None = None, end: Cell | Non
 
 def _several(field: str, start: ArrayLike) -> list[Cell]:
     """A user's cell or cells as a list."""
+    cells = unmasked(field, start, "give (row, column) of a cell to dig")
     try:
-        given = np.asarray(unmasked(field, start, "give (row, column) of a cell to dig"))
+        given = np.asarray(cells)
     except (TypeError, ValueError, OverflowError):
         given = np.empty(0)
     if given.ndim not in (1, 2) or given.shape[-1] != 2 or not given.size or given.dtype.kind not in "iu":
