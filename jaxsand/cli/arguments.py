@@ -42,7 +42,7 @@ def repose(text: str) -> float:
 
 def path_name(text: str) -> Path:
     """The name of a file or folder, not empty."""
-    if not text:
+    if not text.strip():
         raise argparse.ArgumentTypeError("got an empty name")
     return Path(text)
 

@@ -93,6 +93,7 @@ BAD = {
     "an array for a stop": (lambda: js.settle(SAND, LEVEL, stop=np.eye(9)), r"stop: got an array of shape \[9, 9\]"),
     "a word for a sub-step": (lambda: js.step(SAND, LEVEL, STROKE, push=js.SteppedPush("x")), "push.substep: got 'x'"),
     "an array for an environment": (lambda: js.make(np.eye(9)), r"name: got an array of shape \[9, 9\]"),
+    "boundless seconds for a plan": (lambda: js.plan(np.ones((2, 2), bool), seconds=10**400), "seconds: got 1000.*; give a number above 0"),
     "an array for an engine": (lambda: js.plan(np.ones((2, 2), bool), engine=np.eye(9)), r"engine: got an array"),
     "a start of several lengths": (lambda: js.plan(np.ones((2, 2), bool), [[1, 2], [3]]), r"start: got \[\[1, 2\], \[3\]\]"),
 }  # fmt: skip

@@ -4,7 +4,6 @@ The tool moves by one cell north, east, south or west and digs the cell that it 
 mended, so the walk stays on the goal's cells (arXiv:1908.02745, "Single Stroke").
 """
 
-import math
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -24,6 +23,7 @@ __all__ = ["Board", "Cell", "Engine", "Plan", "Problem", "connected_pieces", "ma
 Engine = Literal["auto", "paper", "astar", "exact", "anytime", "frontier"]
 _WIDTH = 16_384
 _UNLIMITED = 1 << 60
+_FAR = 1e18  # above every weight, bound and number of seconds
 _MOST = 1 << 27
 
 
@@ -136,8 +136,8 @@ def _check(problem: Problem, engine: str, weight: float | None, bound: int | Non
             raise ValueError(
                 f"{field}: has no effect with engine {short(engine)}; leave it out, or use {' or '.join(users)}"
             )
-        if not (isinstance(value, (int, float, np.number)) and 0 < value < math.inf):
-            raise ValueError(f"{field}: got {short(value)}; give a number above 0")
+        if not (isinstance(value, (int, float, np.number)) and 0 < value <= _FAR):
+            raise ValueError(f"{field}: got {short(value)}; give a number above 0 and at most {_FAR:g}")
     if bound is not None and int(bound) != bound:
         raise ValueError(f"bound: got {bound}; give a whole number")
     if bound is not None and seconds is not None:
