@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import jaxsand
 from jaxsand.bench.tables import as_table
-from jaxsand.cli.files import existing, folder, progress, write_json, written
+from jaxsand.cli.files import existing, folder, progress, write_json
 from jaxsand.cli.printing import lines, show
+from jaxsand.goals.writing import written
 from jaxsand.scene.progress import Tell
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxsand.cli.arguments import Parser, ended, path_name
-from jaxsand.cli.files import existing, written
+from jaxsand.cli.files import existing
+from jaxsand.goals.writing import written
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +38,7 @@ def curve(run: Path) -> dict[str, np.ndarray]:
             else:
                 done += next(row[name] for name in _COUNTS if name in row)
         figures = np.array(points, float)
-    except (ValueError, KeyError, TypeError, StopIteration) as error:
+    except (ValueError, KeyError, TypeError, StopIteration, OverflowError, RecursionError) as error:
         raise ValueError(f"run: cannot read {file} ({type(error).__name__}); give folders of runs of this version") from None
     if not points:
         raise ValueError(f"run: {run} holds no validation yet; train it on with --resume")

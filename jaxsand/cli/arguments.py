@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -41,7 +42,7 @@ def repose(text: str) -> float:
 
 def path_name(text: str) -> Path:
     """The name of a file or folder, not empty."""
-    if not text:
+    if not text.strip():
         raise argparse.ArgumentTypeError("got an empty name")
     return Path(text)
 
@@ -76,19 +77,36 @@ def ended(work: Callable[[], None]) -> int:
     """The exit code of a command: 0, or what its mistakes, the keyboard and closed pipes end it with."""
     try:
         work()
-    except ValueError as error:
-        return fail(str(error))
-    except RuntimeError as error:
-        if type(error).__name__ != "OutcomeError":
-            raise
-        return fail(f"outcome: {error}")
+        sys.stdout.flush()
     except KeyboardInterrupt as error:
         print(str(error) or "stopped", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+    except Exception as error:
+        mistake = _mistake(error)
+        if isinstance(error, OSError) and error.filename is None:  # what is printed cannot be: it need not be at the end
+            with suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return 1
+        if mistake is None:
+            raise
+        return fail(mistake)
     return 0
+
+
+def _mistake(error: Exception) -> str | None:
+    """What an error says to a user; None for what is a fault of the program's own."""
+    match error:
+        case ValueError():
+            return str(error)
+        case OSError():
+            file = "the output" if error.filename is None else f"{error.filename!s:.200}"
+            return f"file: cannot use {file} ({error.strerror}); choose another, or make room"
+        case RuntimeError() if type(error).__name__ == "OutcomeError":
+            return f"outcome: {error}"
+        case RuntimeError() | MemoryError() if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            return "memory: there is not enough; ask for less: a smaller map or batch, or fewer strokes"
+    return None
 
 
 def fail(message: str) -> int:

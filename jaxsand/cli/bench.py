@@ -7,8 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from jaxsand.cli.files import folder, progress, write_json, written
+from jaxsand.cli.files import folder, progress, write_json
 from jaxsand.cli.printing import show
+from jaxsand.goals.writing import written
 
 _STROKE_GOALS = ("letters", "turned", "rough", "eight")
 

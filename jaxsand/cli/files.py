@@ -4,10 +4,10 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from jaxsand.goals.writing import written
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,10 +22,14 @@ def existing(path: Path, accepted: str = "") -> Path:
             f"{path}: {path.suffix or 'no suffix'} is not read; give a {accepted} file: heights [H, W] in metres, first row "
             "at y = 0, saved with numpy.save (from an .asc or .tif, whose first row is on top: after numpy.flipud)"
         )
-    if path.is_dir():
-        raise ValueError(f"{path}: is a folder; give a file")
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file; check the name")
+    try:
+        if path.is_dir():
+            raise ValueError(f"{path}: is a folder; give a file")
+        there = path.is_file()
+    except OSError:  # a name that is too long, or in a folder that may not be read
+        there = False
+    if not there:
+        raise ValueError(f"{path!s:.200}: no such file; check the name")
     return path
 
 
@@ -61,19 +65,6 @@ def folder(path: Path) -> Path:
     except OSError as error:
         raise ValueError(f"out: cannot write to {path} ({error.strerror}); choose another folder") from None
     return path
-
-
-@contextmanager
-def written(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write to, which takes its place when all went well."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        yield beside
-        beside.replace(path)
-    except OSError as error:
-        raise ValueError(f"out: cannot write {path} ({error.strerror}); choose another folder") from None
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def progress() -> "Tell":

@@ -4,8 +4,9 @@ import argparse
 import time
 from pathlib import Path
 
-from jaxsand.cli.files import folder, progress, read_text, write_json, written
+from jaxsand.cli.files import folder, progress, read_text, write_json
 from jaxsand.cli.printing import lines, plain_name, read_cell, show
+from jaxsand.goals.writing import written
 
 
 def run_plan(options: argparse.Namespace) -> None:

@@ -4,9 +4,11 @@ import argparse
 import math
 import sys
 import time
+from io import BytesIO
 
-from jaxsand.cli.files import existing, folder, plausible, progress, written
+from jaxsand.cli.files import existing, folder, plausible, progress
 from jaxsand.cli.printing import lines, show
+from jaxsand.goals.writing import written
 
 SCHEMES = ("relaxation", "pairwise", "super-time-stepping", "multilevel")
 _TALLEST = 10  # times a map's side: what is higher or lower than that is no sand
@@ -54,8 +56,10 @@ def run_settle(options: argparse.Namespace) -> None:
     ready = time.perf_counter()
     settled = jax.block_until_ready(compiled(heights))
     ran = time.perf_counter() - ready
-    with written(options.out_file) as path, path.open("wb") as file:
-        np.save(file, np.asarray(settled.height))
+    data = BytesIO()  # numpy itself would not notice a full disk
+    np.save(data, np.asarray(settled.height))
+    with written(options.out_file) as path:
+        path.write_bytes(data.getvalue())
     tell("")
     outcome = Outcome(int(settled.outcome))
     report = {

@@ -6,9 +6,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxsand.cli.files import folder, progress, write_json, written
+from jaxsand.cli.files import folder, progress, write_json
 from jaxsand.cli.printing import plain_name, show
 from jaxsand.cli.target import RESOLUTION, read_surface, read_target
+from jaxsand.goals.writing import written
 
 if TYPE_CHECKING:
     from collections.abc import Callable

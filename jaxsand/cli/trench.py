@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxsand.bench.tables import as_table
-from jaxsand.cli.files import as_json, folder, progress, written
+from jaxsand.cli.files import as_json, folder, progress
 from jaxsand.cli.printing import show
+from jaxsand.goals.writing import written
 
 _FILES = ("profiles.csv", "trench.png", "trench-errors.png", "trench.json")
 

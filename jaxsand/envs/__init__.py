@@ -50,6 +50,7 @@ from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, blade_of, make_scene
 from jaxsand.scene.tools import Blade, Bucket
+from jaxsand.scene.validation import short
 from jaxsand.scene.window import Whole, Window
 
 __all__ = [
@@ -168,14 +169,14 @@ def make(name: str, **options: Any) -> tuple[Any, Any]:
       >>> int(state.time)
       1
     """
-    match name:
+    match name if isinstance(name, str) else "":
         case "single-stroke":
             return _single(**options)
         case "multi-stroke":
             return _multi(**options)
         case "excavate":
             return _excavate(**options)
-    raise ValueError(f"name: got {name!r}; give single-stroke, multi-stroke or excavate")
+    raise ValueError(f"name: got {short(name)}; give single-stroke, multi-stroke or excavate")
 
 
 def _single(

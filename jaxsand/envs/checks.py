@@ -23,7 +23,7 @@ from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.masked import unmasked
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Blade, Bucket
-from jaxsand.scene.validation import concrete
+from jaxsand.scene.validation import concrete, short
 
 _KINDS: dict[str, Any] = {
     "on": OnMap | OnSand,
@@ -44,7 +44,7 @@ def check_kinds(options: Mapping[str, object]) -> None:
         kind = _KINDS.get(name)
         if kind is not None and not isinstance(value, kind):
             kinds = ", ".join("None" if k is type(None) else f"{k.__name__}(...)" for k in get_args(kind))
-            raise ValueError(f"{name}: got {value!r:.60}; give one of {kinds}")
+            raise ValueError(f"{name}: got {short(value):.60}; give one of {kinds}")
 
 
 def check_limit(options: Mapping[str, object]) -> None:
@@ -52,14 +52,14 @@ def check_limit(options: Mapping[str, object]) -> None:
     if "limit" in options:
         limit = concrete(options["limit"])
         if limit is not None and not np.all(limit >= 1):
-            raise ValueError(f"limit: got {options['limit']!r}; give 1 step or more to an episode")
+            raise ValueError(f"limit: got {short(options['limit'])}; give 1 step or more to an episode")
 
 
 def check_scene(scene: object, tool_of: Callable[[Scene], Blade | Bucket] = blade_of) -> None:
     """Raises ValueError unless it is a scene with the right tool, by default a blade."""
     if not isinstance(scene, Scene):
         tool = "Blade()" if tool_of is blade_of else "Bucket(width, length, capacity)"
-        raise ValueError(f"scene: got {scene!r:.60}; give make_scene(..., tool={tool})")
+        raise ValueError(f"scene: got {short(scene):.60}; give make_scene(..., tool={tool})")
     tool_of(scene)
 
 
@@ -76,7 +76,7 @@ def check_ready_goals(scene: Scene, goals: LevelGoals | RoughGoals, starts: obje
     if isinstance(goals.goals, Goal):
         _check_ready_weights(goals.goals, maps.shape)
     if starts is not None:
-        raise ValueError(f"starts: got {starts!r} beside goals that are ready; leave it out, or give strokes as goals")
+        raise ValueError(f"starts: got {short(starts)} beside goals that are ready; leave it out, or give strokes as goals")
 
 
 def _check_ready_weights(goal: Goal, shape: tuple[int, ...]) -> None:
@@ -112,7 +112,9 @@ def check_heights(env: MultiStroke | Excavate, tool: Blade | Bucket) -> None:
             return
         raise ValueError(f"heights: got {env.heights}; a bucket scoops between heights: give Heights(lowest, highest)")
     if not isinstance(env.push, SteppedPush):
-        raise ValueError(f"push: got {env.push!r}, which keeps its tool at one depth; give SteppedPush() with Heights()")
+        raise ValueError(
+            f"push: got {short(env.push)}, which keeps its tool at one depth; give SteppedPush() with Heights()"
+        )
 
 
 def check_zones(scene: Scene, zones: Zones) -> None:

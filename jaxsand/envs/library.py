@@ -19,6 +19,7 @@ from jaxsand.goals.surfaces import rested, rough_surface
 from jaxsand.relaxation.settling import check_at_rest
 from jaxsand.scene.masked import gaps
 from jaxsand.scene.scene import Scene, blade_of
+from jaxsand.scene.validation import short
 
 Tree = TypeVar("Tree")
 
@@ -164,7 +165,7 @@ def surfaces(scene: Scene, starts: Starts, count: int, rng: np.random.Generator)
             check_at_rest(scene, start.astype(np.float32), "starts")
         return np.broadcast_to(maps.astype(np.float32), shape)
     if not isinstance(starts, Level | Rough):
-        raise ValueError(f"starts: got {starts!r}; give Level(), Rough(), or maps of sand at rest")
+        raise ValueError(f"starts: got {short(starts)}; give Level(), Rough(), or maps of sand at rest")
     if isinstance(starts, Level):
         return np.zeros(shape, np.float32)
     if not (0 <= starts.relief < np.inf and 0 < starts.scale < np.inf):

@@ -18,6 +18,7 @@ from jaxsand.goals.goal import Goal, Power
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.stopping import Stop as StopRule
 from jaxsand.scene.scene import Scene, blade_of
+from jaxsand.scene.validation import short
 
 Tree = TypeVar("Tree")
 Map = Any
@@ -119,11 +120,11 @@ class Weighted:
         for name in ("above", "below"):
             value = getattr(self, name)
             if not (isinstance(value, int | float | np.number) and 0 <= value < np.inf):
-                raise ValueError(f"measure.{name}: got {value!r}; give a weight of 0 or more")
+                raise ValueError(f"measure.{name}: got {short(value)}; give a weight of 0 or more")
         if not self.above and not self.below:
             raise ValueError("measure: got weights of 0 above and below, which count nothing; give one above 0")
         if self.power not in (1, 2):
-            raise ValueError(f"measure.power: got {self.power!r}; give 1 or 2")
+            raise ValueError(f"measure.power: got {short(self.power)}; give 1 or 2")
 
     def distance(self, goal: Map, height: Map) -> Map:
         """The distance [...] (m) of maps [..., H, W] from goals [..., H, W]."""

@@ -1,6 +1,5 @@
 """Goals as drawings: shapes in metres in a small JSON form, one over the other, drawn on a scene's grid."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,12 +11,12 @@ from jaxsand.goals.fields import LENGTH, METRES, Flag, Object, Pair, Several, Wh
 from jaxsand.goals.goal import Goal, as_goal
 from jaxsand.goals.shapes import WEIGHT, OneShape, Shape
 from jaxsand.goals.surfaces import rested
+from jaxsand.goals.untrusted import read_json
 from jaxsand.scene.grid import Grid
 from jaxsand.scene.scene import Scene, check_scene
 
 _SHAPES = 1000
 _SIDE = 1024  # cells
-_BYTES = 2**24  # of a file
 _MOVED = 0.01  # spacings: what rest moves by less is as it was drawn
 
 
@@ -161,22 +160,9 @@ def as_drawing(drawing: dict[str, Any] | str | Path) -> Drawing:
 def _loaded(path: Path) -> Any:
     """What a JSON file holds."""
     try:
-        if path.stat().st_size > _BYTES:
-            raise ValueError(f"more than {_BYTES >> 20} MiB")
-        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_object)
-    except (OSError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or str(error).split("\n", maxsplit=1)[0]
-        raise ValueError(f'{path}: cannot be read as a drawing ({reason:.80}); give JSON, {{"shapes": [...]}}') from None
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object, whose keys have to differ."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"{twice!r:.40} is given twice")
-    return found
+        return read_json(path)
+    except ValueError as error:
+        raise ValueError(f'{path}: cannot be read as a drawing ({error}); give JSON, {{"shapes": [...]}}') from None
 
 
 def _size(grid: Grid) -> str:

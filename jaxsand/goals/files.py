@@ -6,21 +6,30 @@ sign for cells without data; `read_map` and `write_map` say which.
 
 import json
 import math
+import os
+import reprlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
+from jaxsand.goals.letters import picture
+from jaxsand.goals.untrusted import read_array, read_arrays
+from jaxsand.goals.writing import reason, written
 from jaxsand.scene.masked import gaps
+from jaxsand.scene.validation import finite, positive, short
 
 _NO_DATA = -9999.0  # in .asc files that are written
 _LAYER = "elevation"
 _CHUNK = "jaxsand"  # the text of a PNG that holds spacing, lowest height and step
+_TOLD = ("spacing", "lowest", "step", "x", "y")  # what it holds
+_FAR = 1e12  # m: what a map, its spacing and its corner stay within, so that formats of float32 hold them
 _MOST = 2**28  # cells of a map that is read
+_HEAD = 20  # lines of an .asc file's header
+_AGAIN = "write it anew with write_map, or check that its suffix says what it is"
 
 
 @dataclass(frozen=True)
@@ -44,15 +53,28 @@ class HeightMap:
     corner: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        height = np.asarray(gaps(self.height))
+        try:
+            height = np.asarray(gaps(self.height))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"height: got no array ({reason(error)}); give a map [H, W] in metres") from None
         if height.ndim != 2 or not height.size or height.dtype.kind not in "fiu":
             raise ValueError(f"height: got {height.dtype} of shape {list(height.shape)}; give a map [H, W] in metres")
         if np.isinf(height).any():
             raise ValueError("height: got cells that are infinite; give NaN where nothing is known")
-        if not (math.isfinite(self.spacing) and self.spacing > 0):
-            raise ValueError(f"spacing: got {self.spacing}; give metres, above 0")
-        if not all(map(math.isfinite, self.corner)):
-            raise ValueError(f"corner: got {self.corner}; give x and y in metres")
+        if float(np.abs(height).max(initial=0, where=~np.isnan(height))) > _FAR:
+            raise ValueError(f"height: got cells more than {_FAR:g} m from 0; give metres, and NaN where nothing is known")
+        positive("spacing", self.spacing, "give metres")
+        try:
+            x, y = self.corner
+        except (TypeError, ValueError):
+            raise ValueError(f"corner: got {short(self.corner)}; give x and y in metres") from None
+        for number in (x, y):
+            finite("corner", number, "give x and y in metres")
+        spacing, corner = float(self.spacing), (float(x), float(y))
+        if max(spacing, *map(abs, corner)) > _FAR:
+            raise ValueError(f"spacing: got {spacing:g} with corner {corner}; give metres, at most {_FAR:g}")
+        object.__setattr__(self, "spacing", spacing)
+        object.__setattr__(self, "corner", corner)
         object.__setattr__(self, "height", height if height.dtype.kind == "f" else height.astype(np.float64))
 
 
@@ -74,7 +96,8 @@ def read_map(path: str | Path, *, spacing: float | None = None) -> HeightMap:
       The `HeightMap`: float64 from text and pictures, else as it was saved.
 
     Raises:
-      ValueError: for a file that cannot be read so, or a spacing that is missing or has no effect.
+      ValueError: for a file that cannot be read so, holds pickles, or would unpack to more than 2^26 cells and its own size;
+        for a spacing that is missing or has no effect.
 
     Example:
       >>> import tempfile
@@ -85,7 +108,7 @@ def read_map(path: str | Path, *, spacing: float | None = None) -> HeightMap:
       >>> js.read_map(path).height
       array([[0.25,  nan]])
     """
-    path = Path(path)
+    path = _path(path)
     readers: dict[str, Callable[[Path], HeightMap]] = {".asc": _read_asc, ".npz": _read_npz, ".png": _read_png}
     suffix = path.suffix.lower()
     if suffix != ".npy" and suffix not in readers:
@@ -93,14 +116,16 @@ def read_map(path: str | Path, *, spacing: float | None = None) -> HeightMap:
     if (suffix == ".npy") != (spacing is not None):
         raise ValueError(f"spacing: {'is missing' if spacing is None else f'{suffix} files have their own'}; see read_map")
     try:
+        if not path.exists():
+            raise FileNotFoundError
         if suffix == ".npy" and spacing is not None:
-            return HeightMap(np.load(path, allow_pickle=False), spacing)
+            return HeightMap(read_array(path), spacing)
         return readers[suffix](path)
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; check the name") from None
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, SyntaxError) as error:
-        said = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
-        raise ValueError(f"{path}: cannot be read as a height map: {said}") from None
+    except (OSError, ValueError, KeyError) as error:
+        said = f"{error.args[0]} is missing" if isinstance(error, KeyError) else reason(error)
+        raise ValueError(f"{path}: cannot be read as a height map: {said}; {_AGAIN}") from None
 
 
 def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: float | None = None) -> None:
@@ -122,7 +147,8 @@ def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: floa
       spacing: of the grid (m); for a map that is no `HeightMap`.
 
     Raises:
-      ValueError: for another suffix, gaps where a format has none, and as of `HeightMap`.
+      ValueError: for another suffix, gaps where a format has none, a file that cannot be written (what was there stays),
+        and as of `HeightMap`.
 
     Example:
       >>> import tempfile
@@ -134,7 +160,7 @@ def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: floa
       >>> path.read_text().splitlines()[-1]
       '0.0 0.1'
     """
-    path = Path(path)
+    path = _path(path)
     one = _as_map(height, spacing)
     writers: dict[str, Callable[[HeightMap], bytes]] = {
         ".asc": _asc,
@@ -150,7 +176,9 @@ def write_map(path: str | Path, height: HeightMap | np.ndarray, *, spacing: floa
         raise ValueError(f"{path}: {suffix or 'no suffix'} is not written; give one of {', '.join(writers)}")
     if suffix in (".stl", ".hfield") and np.isnan(one.height).any():
         raise ValueError(f"height: got cells without data, which {suffix} files cannot have; fill them, or write a .ply")
-    path.write_bytes(writers[suffix](one))
+    data = writers[suffix](one)
+    with written(path, "path") as beside:
+        beside.write_bytes(data)
 
 
 def hfield_size(height: HeightMap | np.ndarray, *, spacing: float | None = None) -> tuple[float, float, float, float]:
@@ -181,6 +209,12 @@ def hfield_size(height: HeightMap | np.ndarray, *, spacing: float | None = None)
     return (columns - 1) * one.spacing / 2, (rows - 1) * one.spacing / 2, high, _base(one)
 
 
+def _path(path: str | Path) -> Path:
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path: got {short(path)}; give the name of a file")
+    return Path(path)
+
+
 def _as_map(height: HeightMap | np.ndarray, spacing: float | None) -> HeightMap:
     if isinstance(height, HeightMap):
         if spacing is not None:
@@ -199,10 +233,13 @@ def _base(one: HeightMap) -> float:
 def _read_asc(path: Path) -> HeightMap:
     lines = path.read_text(encoding="ascii").splitlines()
     head: dict[str, float] = {}
-    while lines and (words := lines[0].split()) and words[0][0].isalpha() and words[0].lower() != "nan":
+    for line in lines[:_HEAD]:
+        words = line.split()
+        if not words or not words[0][0].isalpha() or words[0].lower() in ("nan", "inf"):
+            break
         head[words[0].lower()] = float(words[1]) if len(words) == 2 else math.nan
-        lines.pop(0)
-    shape, spacing = (int(head["nrows"]), int(head["ncols"])), head["cellsize"]
+    lines = lines[len(head) :]
+    shape, spacing = (_cells(head, "nrows"), _cells(head, "ncols")), head["cellsize"]
     if min(shape) < 1 or shape[0] * shape[1] > _MOST:
         raise ValueError(f"it has {shape[0]} rows and {shape[1]} columns")
     values = np.array(" ".join(lines).split(), float)
@@ -213,6 +250,13 @@ def _read_asc(path: Path) -> HeightMap:
         head[f"{axis}llcenter"] - spacing / 2 if f"{axis}llcenter" in head else head[f"{axis}llcorner"] for axis in "xy"
     ]
     return HeightMap(values[::-1].copy(), spacing, (corner[0], corner[1]))
+
+
+def _cells(head: dict[str, float], name: str) -> int:
+    """The number of rows or columns in a header."""
+    if not (0 <= head[name] <= _MOST and head[name] % 1 == 0):
+        raise ValueError(f"{name} is {head[name]:g}")
+    return int(head[name])
 
 
 def _asc(one: HeightMap) -> bytes:
@@ -226,11 +270,20 @@ def _asc(one: HeightMap) -> bytes:
 
 
 def _read_npz(path: Path) -> HeightMap:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-        height, spacing = data[_LAYER], float(data["resolution"])
-        middle = data["position"] if "position" in data else np.zeros(2)
-    lengths = spacing * np.array(height.shape[::-1])
-    return HeightMap(height, spacing, (float(middle[0] - lengths[0] / 2), float(middle[1] - lengths[1] / 2)))
+    data = read_arrays(path, (_LAYER, "resolution", "position"))
+    height, spacing = data[_LAYER], float(_numbers(data, "resolution", 1)[0])
+    x, y = _numbers(data, "position", 2) if "position" in data else np.zeros(2)
+    if height.ndim != 2:
+        raise ValueError(f"{_LAYER} has shape {list(height.shape)}")
+    rows, columns = height.shape
+    return HeightMap(height, spacing, (float(x) - spacing * columns / 2, float(y) - spacing * rows / 2))
+
+
+def _numbers(data: dict[str, np.ndarray], name: str, count: int) -> np.ndarray:
+    """So many numbers of a file that has to hold just them."""
+    if data[name].size != count or data[name].dtype.kind not in "iuf":
+        raise ValueError(f"{name} is no {'number' if count == 1 else f'list of {count} numbers'}")
+    return data[name].ravel().astype(float)
 
 
 def _npz(one: HeightMap) -> bytes:
@@ -254,12 +307,16 @@ def _saved(save: Callable[..., Any], **arrays: Any) -> bytes:
 
 
 def _read_png(path: Path) -> HeightMap:
-    from PIL import Image
-
-    with Image.open(path) as image:
-        told = json.loads(getattr(image, "text", {})[_CHUNK])
+    with picture(path) as image:
+        told = json.loads(getattr(image, "text", {}).get(_CHUNK, "null"))
         numbers = np.asarray(image, np.int64)[::-1]
-    spacing, lowest, step, x, y = (float(told[name]) for name in ("spacing", "lowest", "step", "x", "y"))
+    if told is None:
+        raise KeyError(_CHUNK)
+    for name in _TOLD:
+        value = told.get(name) if isinstance(told, dict) else None
+        if not isinstance(value, int | float) or not abs(value) <= _FAR:
+            raise ValueError(f"its text {_CHUNK} has {reprlib.repr(value)} as {name}")
+    spacing, lowest, step, x, y = (float(told[name]) for name in _TOLD)
     return HeightMap(np.where(numbers == 0, np.nan, lowest + (numbers - 1) * step), spacing, (x, y))
 
 

@@ -58,7 +58,7 @@ class Goal:
 
     def __post_init__(self) -> None:
         if not isinstance(self.power, int | float) or self.power not in (1, 2):
-            raise ValueError(f"goal.power: got {self.power!r}; give 1 or 2")
+            raise ValueError(f"goal.power: got {short(self.power)}; give 1 or 2")
         for name in ("height", "above", "below"):
             value: Any = getattr(self, name)
             if isinstance(value, list | tuple | np.ma.MaskedArray):

@@ -3,15 +3,26 @@
 import json
 import math
 import string
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxsand.goals.untrusted import MOST_CELLS, read_array
+from jaxsand.goals.writing import reason
 from jaxsand.scene.masked import POINTS, gaps, unmasked
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 Cell = tuple[int, int]
+
+_PICTURES = ("PNG", "JPEG", "TIFF", "BMP", "GIF")  # which run no other program to be read, as EPS does
+_SIGNS = 100  # of a text
 
 
 def letter_strokes(letter: str) -> np.ndarray:
@@ -88,24 +99,47 @@ def read_image(path: str | Path) -> np.ndarray:
 
     Grey of 16 bits keeps them; numbers in other files than PNG, such as a TIFF's floats, are no shades and refused.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with Image.open(path) as image:
-            if image.mode.startswith(("I", "F")):
-                if image.format != "PNG":
-                    raise ValueError(
-                        f"{path}: got a {image.format} of numbers (mode {image.mode}), which have no white or black; "
-                        "give a PNG, or save heights in metres with numpy.save as .npy"
-                    )
+        with picture(Path(path), _PICTURES) as image:
+            kind = f"{image.format} of numbers (mode {image.mode})"
+            numbers = image.mode.startswith(("I", "F"))
+            if numbers and image.format == "PNG":
                 grey = np.asarray(image, float)  # 16 bits: a height map's usual depth
                 return np.flipud(np.where(grey == image.info.get("transparency"), 0, grey / 65535 - 1))
-            flat = Image.new("RGBA", image.size, "white")
-            flat.alpha_composite(image.convert("RGBA"))
-    except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, OSError) as error:
-        raise ValueError(f"{path}: cannot be read as a picture ({_reason(error)}); give a PNG file") from None
-    grey = np.asarray(flat.convert("L"), float)
-    return np.flipud(grey / 255 - 1)
+            if not numbers:
+                flat = Image.new("RGBA", image.size, "white")
+                flat.alpha_composite(image.convert("RGBA"))
+                return np.flipud(np.asarray(flat.convert("L"), float) / 255 - 1)
+    except ValueError as error:
+        raise ValueError(f"{path}: cannot be read as a picture ({error}); give a PNG file") from None
+    raise ValueError(
+        f"{path}: got a {kind}, which have no white or black; give a PNG, or save heights in metres with numpy.save as .npy"
+    )
+
+
+@contextmanager
+def picture(path: Path, kinds: tuple[str, ...] = ("PNG",)) -> Iterator["Image"]:
+    """Opens a picture of some kinds.
+
+    Raises:
+      ValueError: says in a few words why it cannot be read: it is spoilt, of another kind, or too large.
+    """
+    import warnings
+
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            image = Image.open(path, formats=kinds)
+        with image:
+            if image.width * image.height > MOST_CELLS:
+                raise ValueError(f"{image.width} x {image.height} pixels, and at most {MOST_CELLS} are read")
+            yield image
+    except Exception as error:  # a spoilt picture may raise anything, while it is opened or read
+        raise ValueError(reason(error)) from None
 
 
 def read_heights(path: str | Path, no_data: float | None = None) -> np.ndarray:
@@ -114,16 +148,11 @@ def read_heights(path: str | Path, no_data: float | None = None) -> np.ndarray:
     Cells that hold the value `no_data` become NaN.
     """
     try:
-        with Path(path).open("rb") as file:
-            if file.read(6) != b"\x93NUMPY":
-                raise ValueError("it does not begin as one")
-            file.seek(0)
-            heights = np.load(file, allow_pickle=False)
-    except Exception as error:  # a spoilt header may raise anything, from a tokenizer's errors to a lack of memory
-        raise ValueError(f"{path}: cannot be read as a .npy array ({_reason(error)}); save one with numpy.save") from None
-    if not isinstance(heights, np.ndarray) or heights.ndim != 2 or not heights.size:
-        shape = list(getattr(heights, "shape", []))
-        raise ValueError(f"{path}: got shape {shape}; give one height map [H, W] with at least one cell")
+        heights = read_array(Path(path))
+    except ValueError as error:
+        raise ValueError(f"{path}: cannot be read as a .npy array ({error}); save one with numpy.save") from None
+    if heights.ndim != 2 or not heights.size:
+        raise ValueError(f"{path}: got shape {list(heights.shape)}; give one height map [H, W] with at least one cell")
     if heights.dtype.kind not in "fiu":
         raise ValueError(f"{path}: got dtype {heights.dtype}; give heights in metres as floats")
     if heights.dtype.itemsize > 8:
@@ -143,6 +172,8 @@ def text_strokes(text: str) -> np.ndarray:
         from HersheyFonts import HersheyFonts
     except ImportError:
         raise ValueError(f"text: {text!r} needs the Hershey fonts; run pip install 'jaxsand[letters]'") from None
+    if len(text) > _SIGNS:
+        raise ValueError(f"text: got {len(text)} signs; give at most {_SIGNS}")
     font = HersheyFonts()
     font.load_default_font("rowmans")
     lines = np.array([[a[0], -a[1], b[0], -b[1]] for a, b in font.lines_for_text(text)], float)
@@ -183,7 +214,3 @@ def same(heights: np.ndarray, value: float) -> np.ndarray:
         return np.isnan(heights)
     with np.errstate(over="ignore"):
         return heights == (heights.dtype.type(value) if heights.dtype.kind == "f" else value)
-
-
-def _reason(error: BaseException) -> str:
-    return (getattr(error, "strerror", None) or str(error).split("\n")[0])[:80]

@@ -18,6 +18,7 @@ from jaxsand.goals.surfaces import places, rested, rough_surface, terrain_surfac
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, make_scene
 from jaxsand.scene.tools import Blade
+from jaxsand.scene.validation import short
 
 _CHANGED = 0.1  # of the largest change that is asked for: what counts as changed, and as done
 
@@ -71,7 +72,7 @@ def make_task(name: str, key: int = 0) -> Task:
         ((16, 32), 24)
     """
     if not isinstance(name, str) or name not in TASKS:
-        raise ValueError(f"name: got {name!r}; give one of {', '.join(TASKS)}")
+        raise ValueError(f"name: got {short(name)}; give one of {', '.join(TASKS)}")
     check_whole("key", key, 0)
     return TASKS[name](np.random.default_rng(key))
 

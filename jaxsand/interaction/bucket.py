@@ -27,6 +27,7 @@ from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
 from jaxsand.scene.footprint import Pose
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
 from jaxsand.scene.tools import Blade, Bucket
+from jaxsand.scene.validation import short
 from jaxsand.scene.window import Whole, Window
 
 
@@ -128,7 +129,7 @@ def _scoop(
     """`scoop`, and what `record` returned after each leg."""
     bucket = bucket_of(scene)
     if push is not None and not isinstance(push, SteppedPush):
-        raise ValueError(f"push: got {push!r}; a bucket scoops by SteppedPush(substep, sweeps)")
+        raise ValueError(f"push: got {short(push)}; a bucket scoops by SteppedPush(substep, sweeps)")
     edge = replace(scene, tool=Blade(bucket.width, scene.grid.spacing, bucket.depth))
     edge, height, rules = checked(edge, height, push, scheme, stop)
     path = as_path(path, height.dtype)

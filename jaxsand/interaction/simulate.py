@@ -23,6 +23,7 @@ from jaxsand.relaxation.stopping import Outcome, Stop, check_rule
 from jaxsand.scene.footprint import Pose
 from jaxsand.scene.masked import POINTS
 from jaxsand.scene.scene import Scene, as_array, cast, check_scene, fit
+from jaxsand.scene.validation import short
 from jaxsand.scene.window import Whole, Window
 
 Rules = tuple[PushRule, Scheme, Stop]
@@ -321,7 +322,7 @@ def windows_for(scene: Scene, push: PushRule, times: float = 1) -> Iterator[Scen
 def check_push(push: object) -> None:
     """Raises ValueError unless it is one of the pushes."""
     if isinstance(push, type) or not isinstance(push, PushRule):
-        raise ValueError(f"push: got {push!r}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
+        raise ValueError(f"push: got {short(push)}; give SteppedPush(substep, sweeps), SwathPush() or SplitPush()")
 
 
 def checked(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
@@ -12,6 +13,7 @@ from jaxsand.interaction.wheel_stepped import roll_along
 from jaxsand.relaxation.stopping import check_rate, check_whole
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, Bucket, NoTool, Wheel
+from jaxsand.scene.validation import short
 
 
 @jax.tree_util.register_dataclass
@@ -56,8 +58,8 @@ class SteppedPush:
                 f"push: got SteppedPush for a {type(scene.tool).__name__}; SteppedPush() is for a Blade or a Wheel, "
                 + ("call js.scoop and js.dump" if isinstance(scene.tool, Bucket) else "give a PushRule that moves this tool")
             )
-        if not 0 < self.substep <= 1:
-            raise ValueError(f"push.substep: got {self.substep!r}; give a part of a spacing, above 0 and at most 1")
+        if not (isinstance(self.substep, int | float | np.number) and 0 < self.substep <= 1):
+            raise ValueError(f"push.substep: got {short(self.substep)}; give a part of a spacing, above 0 and at most 1")
         check_whole("push.sweeps", self.sweeps, 0)
         check_rate(scene, "push.rate", self.rate)
 

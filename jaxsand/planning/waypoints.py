@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxsand.goals.writing import written
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade, Bucket
 
@@ -102,14 +103,14 @@ def write_waypoints(file: Path | str, places: np.ndarray) -> None:
     """Writes waypoints [n, 4] as .csv, with a line of names first, or as .json, a list of objects; lengths are in metres.
 
     Raises:
-        ValueError: for another kind of file.
+        ValueError: for another kind of file, or one that cannot be written; what was there stays.
     """
     file = Path(file)
     rows = [[*map(float, place[:3]), bool(place[3])] for place in places]
-    if file.suffix == ".json":
-        file.write_text(json.dumps([dict(zip(FIELDS, row, strict=True)) for row in rows], indent=1) + "\n", encoding="utf-8")
-    elif file.suffix == ".csv":
-        with file.open("w", newline="", encoding="utf-8") as out:
-            csv.writer(out).writerows([FIELDS, *([*row[:3], int(row[3])] for row in rows)])
-    else:
+    if file.suffix not in (".csv", ".json"):
         raise ValueError(f"file: got {str(file)!r}; give a name that ends in .csv or .json")
+    with written(file, "file") as beside, beside.open("w", newline="", encoding="utf-8") as out:
+        if file.suffix == ".json":
+            out.write(json.dumps([dict(zip(FIELDS, row, strict=True)) for row in rows], indent=1) + "\n")
+        else:
+            csv.writer(out).writerows([FIELDS, *([*row[:3], int(row[3])] for row in rows)])

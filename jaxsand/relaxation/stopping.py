@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsand.relaxation.schemes import Multilevel, Pairwise, Relaxation, Scheme, SuperTimeStepping, stable_rate
 from jaxsand.scene.boundaries import Base
 from jaxsand.scene.scene import Scene, as_array, check_scene, check_window
-from jaxsand.scene.validation import concrete
+from jaxsand.scene.validation import concrete, short
 from jaxsand.scene.window import Whole, Window
 
 _MOST = 1_000_000_000  # sweeps, which are counted in 32 bits
@@ -123,11 +123,11 @@ def check_rule(scene: Scene, scheme: Scheme | None, stop: Stop | None) -> tuple[
         if isinstance(scheme, Multilevel):
             raise ValueError("stop: got Sweeps with Multilevel, which settles until still; give UntilStill()")
     else:
-        raise ValueError(f"stop: got {stop!r}; give UntilStill() or Sweeps(count)")
+        raise ValueError(f"stop: got {short(stop)}; give UntilStill() or Sweeps(count)")
     _check_number("stop.tolerance", stop.tolerance)
     tolerance = concrete(stop.tolerance)
     if tolerance is not None and not ((tolerance >= 0) & (tolerance < float("inf"))).all():
-        raise ValueError(f"stop.tolerance: got {stop.tolerance!r}; give a slope of 0 or more, such as 1e-3")
+        raise ValueError(f"stop.tolerance: got {short(stop.tolerance)}; give a slope of 0 or more, such as 1e-3")
     return scheme, stop
 
 
@@ -138,13 +138,13 @@ def _check_scheme(scene: Scene, scheme: Scheme) -> None:
         _check_number("scheme.share", scheme.share)
         share = concrete(scheme.share)
         if share is not None and not ((share > 0) & (share <= 1)).all():
-            raise ValueError(f"scheme.share: got {scheme.share!r}; give a share above 0 and up to 1")
+            raise ValueError(f"scheme.share: got {short(scheme.share)}; give a share above 0 and up to 1")
         if scene.grid.neighbours == "isotropic":
             raise ValueError("scheme: got Pairwise with isotropic sand, which does not flow in pairs; use 4 or 8 neighbours")
     elif isinstance(scheme, SuperTimeStepping | Multilevel):
         for name, value, most in (("growth", scheme.growth, 4), ("first", scheme.first, 1), ("safety", scheme.safety, 1)):
             if not (isinstance(value, int | float) and 1e-4 <= value <= most):
-                raise ValueError(f"scheme.{name}: got {value!r}; give a number from 1e-4 to {most}")
+                raise ValueError(f"scheme.{name}: got {short(value)}; give a number from 1e-4 to {most}")
         if isinstance(scheme, Multilevel):
             if isinstance(scene.base, Base):
                 raise ValueError(
@@ -152,9 +152,9 @@ def _check_scheme(scene: Scene, scheme: Scheme) -> None:
                 )
             check_whole("scheme.coarsest", scheme.coarsest, 2)
             if not (isinstance(scheme.handover, int | float) and 1 <= scheme.handover < float("inf")):
-                raise ValueError(f"scheme.handover: got {scheme.handover!r}; give a time of at least 1, such as 128")
+                raise ValueError(f"scheme.handover: got {short(scheme.handover)}; give a time of at least 1, such as 128")
     else:
-        raise ValueError(f"scheme: got {scheme!r}; give Relaxation, Pairwise, SuperTimeStepping or Multilevel")
+        raise ValueError(f"scheme: got {short(scheme)}; give Relaxation, Pairwise, SuperTimeStepping or Multilevel")
 
 
 def check_settling_window(scene: Scene, scheme: Scheme, window: Whole | Window | None) -> Whole | Window:
@@ -163,7 +163,9 @@ def check_settling_window(scene: Scene, scheme: Scheme, window: Whole | Window |
     check_window(window, scene.grid.shape)
     if isinstance(window, Window) and isinstance(scheme, Pairwise | Multilevel):
         name = type(scheme).__name__
-        raise ValueError(f"window: got {window!r} with {name}, which depends on where the map begins; use another scheme")
+        raise ValueError(
+            f"window: got {short(window)} with {name}, which depends on where the map begins; use another scheme"
+        )
     return window
 
 
@@ -173,9 +175,9 @@ def check_rate(scene: Scene, name: str, value: Float[ArrayLike, ""]) -> None:
     rate = concrete(value)
     limit = stable_rate(scene)
     if rate is not None and not (rate > 0).all():
-        raise ValueError(f"{name}: got {value!r}; give a positive share such as 0.125")
+        raise ValueError(f"{name}: got {short(value)}; give a positive share such as 0.125")
     if rate is not None and not (rate <= limit).all():
-        raise ValueError(f"{name}: got {value!r}, unstable above {limit:.4f}; the paper uses 0.125")
+        raise ValueError(f"{name}: got {short(value)}, unstable above {limit:.4f}; the paper uses 0.125")
 
 
 def as_batch(height: Float[ArrayLike, "B H W"]) -> Float[Array, "B H W"]:
@@ -195,9 +197,9 @@ def check_chunk(chunk: int | None) -> None:
 def check_whole(name: str, value: object, least: int, most: int | None = None) -> None:
     """Raises ValueError unless the value is a whole number from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name}: got {value!r}; give a whole number of at least {least}")
+        raise ValueError(f"{name}: got {short(value)}; give a whole number of at least {least}")
     if most is not None and value > most:
-        raise ValueError(f"{name}: got {value!r}; give at most {most:,}")
+        raise ValueError(f"{name}: got {short(value)}; give at most {most:,}")
 
 
 def _check_number(name: str, value: ArrayLike) -> None:
@@ -206,4 +208,4 @@ def _check_number(name: str, value: ArrayLike) -> None:
     except TypeError:
         single = False
     if not single:
-        raise ValueError(f"{name}: got {value!r}; give one number, and use jax.vmap for several")
+        raise ValueError(f"{name}: got {short(value)}; give one number, and use jax.vmap for several")

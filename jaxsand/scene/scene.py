@@ -16,7 +16,7 @@ from jaxsand.scene.grid import Grid, Neighbours
 from jaxsand.scene.masked import BED, unmasked
 from jaxsand.scene.material import DRY_SAND, Material
 from jaxsand.scene.tools import Blade, NoTool, Tool, square
-from jaxsand.scene.validation import concrete, finite, positive
+from jaxsand.scene.validation import concrete, finite, positive, short
 from jaxsand.scene.window import AsNeeded, Whole, Window
 
 T = TypeVar("T")
@@ -112,7 +112,7 @@ def make_scene(
     _angle(repose_angle, shape)
     known = neighbours == "isotropic" if isinstance(neighbours, str) else isinstance(neighbours, int | np.integer)
     if not known or neighbours not in (4, 8, "isotropic"):
-        raise ValueError(f'neighbours: got {neighbours!r}; choose 4, 8 or "isotropic"')
+        raise ValueError(f'neighbours: got {short(neighbours)}; choose 4, 8 or "isotropic"')
     scene = Scene(
         Grid(_number(spacing), shape, neighbours if isinstance(neighbours, str) else 4 if neighbours == 4 else 8),
         Material(_number(repose_angle)),
@@ -128,7 +128,7 @@ def make_scene(
     check_window(scene.window, shape)
     if isinstance(scene.tool, type) or not isinstance(scene.tool, Tool):
         raise ValueError(
-            f"tool: got {tool!r}; give NoTool(), Blade(width, thickness, depth), Wheel(radius, width, sinkage), "
+            f"tool: got {short(tool)}; give NoTool(), Blade(width, thickness, depth), Wheel(radius, width, sinkage), "
             "or a Tool of your own"
         )
     scene.tool.check(scene.grid)
@@ -196,7 +196,7 @@ def fit(scene: Scene, height: Float[ArrayLike, "H W"]) -> tuple[Scene, Float[Arr
         raise ValueError(f"repose_angle: got an angle of {which} in {height.dtype}; give another, or float64 heights")
     if spacing is not None and not np.all(spacing.astype(height.dtype) ** 2 > 0):
         raise ValueError(
-            f"spacing: got {scene.grid.spacing!r}, whose square is 0 in {height.dtype}; give metres, such as 0.01"
+            f"spacing: got {short(scene.grid.spacing)}, whose square is 0 in {height.dtype}; give metres, such as 0.01"
         )
     return cast(scene, height.dtype), height
 
@@ -214,7 +214,7 @@ def as_array(name: str, value: ArrayLike | npt.ArrayLike, dtype: DTypeLike | Non
     value = unmasked(name, value, masked)
     try:
         return jnp.asarray(value, dtype)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         reason = str(error).split("\n", maxsplit=1)[0][:80]
         raise ValueError(f"{name}: got {type(value).__name__}, no array of numbers ({reason}); give numbers") from None
 
@@ -241,7 +241,7 @@ def _shape(shape: tuple[int, int]) -> tuple[int, int]:
     except (TypeError, ValueError, OverflowError):
         good = False
     if not good:
-        raise ValueError(f"shape: got {shape!r}; give two whole numbers of at least 1, (rows, columns)")
+        raise ValueError(f"shape: got {short(shape)}; give two whole numbers of at least 1, (rows, columns)")
     return int(rows), int(columns)
 
 
@@ -273,15 +273,14 @@ def _check_walls(walls: object, shape: tuple[int, int]) -> None:
                 f"walls.solid: got {solid.dtype} of shape {list(solid.shape)}; give booleans of shape {list(shape)}"
             )
     elif not isinstance(walls, Open):
-        got = type(walls).__name__ if hasattr(walls, "shape") else repr(walls)
-        raise ValueError(f"walls: got {got}; give Open() or Walls(solid)")
+        raise ValueError(f"walls: got {short(walls)}; give Open() or Walls(solid)")
 
 
 def _check_edge(edge: object) -> None:
     if isinstance(edge, Draining):
         finite("edge.level", edge.level, "give the height of the rim in metres")
     elif not isinstance(edge, Closed):
-        raise ValueError(f"edge: got {edge!r}; give Closed() or Draining(level)")
+        raise ValueError(f"edge: got {short(edge)}; give Closed() or Draining(level)")
 
 
 def _as_base(base: Deep | Base) -> Deep | Base:
@@ -300,8 +299,7 @@ def _check_base(base: object, shape: tuple[int, int]) -> None:
         if height is not None and not np.all(np.isfinite(height)):
             raise ValueError("base.height: got a number that is not finite; give metres, such as -0.06")
     elif not isinstance(base, Deep):
-        got = type(base).__name__ if hasattr(base, "shape") else repr(base)
-        raise ValueError(f"base: got {got}; give Deep() or Base(height)")
+        raise ValueError(f"base: got {short(base)}; give Deep() or Base(height)")
 
 
 def check_window(window: object, shape: tuple[int, int]) -> None:
@@ -315,10 +313,12 @@ def check_window(window: object, shape: tuple[int, int]) -> None:
             inside = False
         if not inside:
             raise ValueError(
-                f"window.size: got {window.size!r}; give (rows, columns) from 1 up to the map's {shape}, or use Whole()"
+                f"window.size: got {short(window.size)}; give (rows, columns) from 1 up to the map's {shape}, or use Whole()"
             )
         tolerance = concrete(window.tolerance)
         if tolerance is not None and not np.all(tolerance >= 0):
-            raise ValueError(f"window.tolerance: got {window.tolerance!r}; give 0 or a small positive number of spacings")
+            raise ValueError(
+                f"window.tolerance: got {short(window.tolerance)}; give 0 or a small positive number of spacings"
+            )
     elif not isinstance(window, AsNeeded | Whole):
-        raise ValueError(f"window: got {window!r}; give AsNeeded(), Whole() or Window(size)")
+        raise ValueError(f"window: got {short(window)}; give AsNeeded(), Whole() or Window(size)")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import jax
 import numpy as np
 
-from jaxsand.scene.validation import concrete
+from jaxsand.scene.validation import concrete, short
 
 Scalar = jax.Array | float
 TINY = float(np.finfo(np.float32).tiny)
@@ -70,4 +70,4 @@ def check_number(name: str, value: Scalar, low: float, high: Scalar, remedy: str
     array = concrete(value)
     if array is not None and not (array.ndim == 0 and np.isfinite(array) and low <= array <= high):
         least = "above" if low else "of at least"
-        raise ValueError(f"{name}: got {value!r}; give one finite number {least} 0, at most {high}: {remedy}")
+        raise ValueError(f"{name}: got {short(value)}; give one finite number {least} 0, at most {high}: {remedy}")

@@ -104,7 +104,9 @@ class Blade:
             finite("tool.yaw", self.yaw, "give the angle from the way to the blade's normal in rad, or None")
             yaw = concrete(self.yaw)
             if yaw is not None and abs(yaw) > MOST_YAW * (1 + 1e-6):
-                raise ValueError(f"tool.yaw: got {self.yaw!r} rad; give -pi/3 to pi/3: for degrees use math.radians(30)")
+                raise ValueError(
+                    f"tool.yaw: got {short(self.yaw)} rad; give -pi/3 to pi/3: for degrees use math.radians(30)"
+                )
         if self.plates is not None:
             positive("tool.plates", self.plates, "give how far the plates reach ahead in metres, or None")
             _within_the_map({"plates": self.plates}, grid)
@@ -249,10 +251,10 @@ class Wheel:
         finite("tool.slip_angle", self.slip_angle, "give the angle from the wheel's plane to its way in rad")
         radius, sinkage, slip = map(concrete, (self.radius, self.sinkage, self.slip_angle))
         if self.load is None and sinkage is not None and radius is not None and sinkage > radius:
-            raise ValueError(f"tool.sinkage: got {self.sinkage!r} m, deeper than the axle; give at most the radius")
+            raise ValueError(f"tool.sinkage: got {short(self.sinkage)} m, deeper than the axle; give at most the radius")
         if slip is not None and abs(slip) > math.pi / 2 * (1 + 1e-6):
             raise ValueError(
-                f"tool.slip_angle: got {self.slip_angle!r} rad; give -pi/2 to pi/2: for degrees use math.radians(45)"
+                f"tool.slip_angle: got {short(self.slip_angle)} rad; give -pi/2 to pi/2: for degrees use math.radians(45)"
             )
         sizes = {"radius": self.radius, "width": self.width}
         _at_least_a_cell("wheel", sizes, grid)
@@ -264,7 +266,7 @@ class Wheel:
                     got = short(getattr(self.grousers, name))
                     raise ValueError(f"tool.grousers.{name}: got {got}; it must be one finite number of 0 or more")
         elif not isinstance(self.grousers, Smooth):
-            raise ValueError(f"tool.grousers: got {self.grousers!r}; give Smooth() or Grousers(height, fill, spin)")
+            raise ValueError(f"tool.grousers: got {short(self.grousers)}; give Smooth() or Grousers(height, fill, spin)")
         _check_load(self)
 
 
@@ -303,7 +305,7 @@ def _at_least_a_cell(kind: str, sizes: dict[str, Number], grid: Grid) -> None:
         size = concrete(value)
         if size is not None and dx is not None and np.any(size < dx * (1 - 1e-6)):
             raise ValueError(
-                f"tool.{name}: got {value!r} m, less than a cell of {grid.spacing!r} m; "
+                f"tool.{name}: got {short(value)} m, less than a cell of {short(grid.spacing)} m; "
                 f"enlarge the {kind} or refine the grid"
             )
 
@@ -314,7 +316,8 @@ def _within_the_map(sizes: dict[str, Number], grid: Grid) -> None:
         size = concrete(value)
         if size is not None and dx is not None and np.any(size > dx * max(2, math.hypot(*grid.shape))):
             raise ValueError(
-                f"tool.{name}: got {value!r} m, more than the map's diagonal; give lengths in metres, or enlarge the map"
+                f"tool.{name}: got {short(value)} m, more than the map's diagonal; give lengths in metres, or enlarge "
+                "the map"
             )
 
 

@@ -7,6 +7,8 @@ import numpy as np
 
 from jaxsand.scene.masked import gaps
 
+_LONGEST = 100  # signs of a value in a message
+
 
 def concrete(value: object) -> np.ndarray | None:
     """The value as a numpy array (NaN for what is no number), or None if it is being traced."""
@@ -14,8 +16,10 @@ def concrete(value: object) -> np.ndarray | None:
         return None
     try:
         array = np.asarray(gaps(value))
-    except (TypeError, ValueError):
+    except TypeError:  # a list with a traced value in it
         return None
+    except ValueError:
+        return np.full((), np.nan)
     return array if array.dtype.kind in "fiub" else np.full((), np.nan)
 
 
@@ -34,5 +38,9 @@ def finite(name: str, value: object, remedy: str) -> None:
 
 
 def short(value: Any) -> str:
-    """A value as messages show it: a number as it is, of an array its shape."""
-    return repr(value) if np.ndim(value) == 0 else f"an array of shape {list(np.shape(value))}"
+    """A value as messages show it, on a line: a number as it is, of an array its shape, of anything else its beginning."""
+    shape: tuple[int, ...] = getattr(value, "shape", ()) if hasattr(value, "dtype") else ()
+    if shape:
+        return f"an array of shape {list(shape)}"
+    said = " ".join(repr(value).split())
+    return said if len(said) <= _LONGEST else said[: _LONGEST - 3] + "..."

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxsand.scene.validation import short
 from jaxsand.terramechanics._limit import Reference, seek_limit
 
 Model = TypeVar("Model")
@@ -139,7 +140,7 @@ class Range:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
-            raise ValueError(f"free: got {self.low!r} to {self.high!r} for {self.name}; give a finite (low, high)")
+            raise ValueError(f"free: got {short(self.low)} to {short(self.high)} for {self.name}; give a finite (low, high)")
 
 
 def as_ranges(free: Free) -> dict[str, tuple[float, float] | None]:
@@ -151,14 +152,14 @@ def as_ranges(free: Free) -> dict[str, tuple[float, float] | None]:
         raise ValueError("free: got no names; free at least one parameter")
     for name, ends in ranges.items():
         if ends is not None and (np.shape(ends) != (2,) or np.asarray(ends).dtype.kind not in "iuf"):
-            raise ValueError(f"free: got {ends!r} for {name}; give (low, high)")
+            raise ValueError(f"free: got {short(ends)} for {name}; give (low, high)")
     return ranges
 
 
 def check_noise(noise: float | None) -> None:
     """Raises ValueError unless the noise is None or a positive number."""
     if noise is not None and not (isinstance(noise, int | float | np.number) and 0 < noise < math.inf):
-        raise ValueError(f"noise: got {noise!r}; give its sigma in metres, such as 6e-4, or None to estimate it")
+        raise ValueError(f"noise: got {short(noise)}; give its sigma in metres, such as 6e-4, or None to estimate it")
 
 
 def spread(ranges: list[Range], starts: int) -> np.ndarray:

@@ -22,7 +22,7 @@ from jaxsand.scene.masked import POINTS, gaps, unmasked
 from jaxsand.scene.material import Material
 from jaxsand.scene.scene import Scene, as_array, fit
 from jaxsand.scene.tools import NoTool
-from jaxsand.scene.validation import concrete
+from jaxsand.scene.validation import concrete, short
 from jaxsand.terramechanics._least_squares import (
     Calibration,
     Free,
@@ -151,7 +151,7 @@ def calibrate(
     if push is not None:
         check_push(push)
     if not isinstance(grid, TwoGrids | OneGrid):
-        raise ValueError(f"grid: got {grid!r}; give TwoGrids() or OneGrid()")
+        raise ValueError(f"grid: got {short(grid)}; give TwoGrids() or OneGrid()")
     groups, seen = _grouped(scene, some)
     labels = _labels(scene, regions)
     ranges, names = _ranges(scene, free, 0 if labels is None else int(labels.max()) + 1)
@@ -324,7 +324,9 @@ def _ranges(scene: Scene, free: Free, regions: int) -> tuple[list[Range], tuple[
             guess = float(np.mean(np.asarray(scene.material.repose_angle)))
             low, high = asked[name] or _ANGLES
             if not 0 < low < high < math.pi / 2:
-                raise ValueError(f"free: got {low!r} to {high!r} for repose_angle; give rad above 0 and below pi/2")
+                raise ValueError(
+                    f"free: got {short(low)} to {short(high)} for repose_angle; give rad above 0 and below pi/2"
+                )
             many = [f"{name}[{k}]" for k in range(regions)] or [name]
             ranges += [Range(one, low, high, guess) for one in many]
         else:
@@ -338,8 +340,12 @@ def _range_of_tool(scene: Scene, name: str, guess: float, ends: tuple[float, flo
     most = {"slip_angle": math.pi / 2, "sinkage": float(getattr(scene.tool, "radius", math.inf))}.get(name, math.inf)
     if ends is None:
         if not guess > 0:
-            raise ValueError(f"free: got a guess of {guess!r} for {name}; give its range, as in {{{name!r}: (low, high)}}")
+            raise ValueError(
+                f"free: got a guess of {short(guess)} for {name}; give its range, as in {{{name!r}: (low, high)}}"
+            )
         ends = max(guess / 3, least), min(3 * guess, most)
     if not least * (1 - 1e-6) <= ends[0] < ends[1] <= most:
-        raise ValueError(f"free: got {ends[0]!r} to {ends[1]!r} for {name}; give (low, high) from {least:g} to {most:g}")
+        raise ValueError(
+            f"free: got {short(ends[0])} to {short(ends[1])} for {name}; give (low, high) from {least:g} to {most:g}"
+        )
     return Range(name, *ends, guess)

@@ -23,7 +23,7 @@ from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, cast, fit
 from jaxsand.scene.soil import TINY, Scalar, Soil, check_number, check_soil
 from jaxsand.scene.tools import Blade, square
-from jaxsand.scene.validation import concrete
+from jaxsand.scene.validation import concrete, short
 
 
 @jax.tree_util.register_dataclass
@@ -237,7 +237,7 @@ def cut_ahead(scene: Scene, height: jax.typing.ArrayLike, pose: Pose, soil: Soil
     scene, height = fit(scene, height)
     blade, dx = scene.tool, jnp.asarray(scene.grid.spacing)
     if not isinstance(blade, Blade):
-        raise ValueError(f"tool: got {blade!r}; give the scene a Blade(width, thickness, depth)")
+        raise ValueError(f"tool: got {short(blade)}; give the scene a Blade(width, thickness, depth)")
     square(blade)
     soil, pose, level = cast((soil, pose, level), height.dtype)
     ahead = jnp.asarray(blade.thickness) / 2 + 1.5 * dx

@@ -19,6 +19,7 @@ from jaxsand.relaxation.schemes import SuperTimeStepping
 from jaxsand.relaxation.settling import settle_batch
 from jaxsand.relaxation.stopping import UntilStill
 from jaxsand.scene.scene import make_scene
+from jaxsand.scene.validation import short
 
 _TEN = math.radians(10)
 
@@ -354,7 +355,9 @@ def relaxing(reach: float = 0.2, spacing: float = 1e-3) -> Callable[[Pass], Prof
 
     def relax(run: Pass) -> Profile:
         if max(map(abs, unsettled(run).toes)) > reach - 10 * spacing:
-            raise ValueError(f"reach: got {reach!r} m, too little for a sinkage of {run.sinkage * 1e3:.4g} mm; give more")
+            raise ValueError(
+                f"reach: got {short(reach)} m, too little for a sinkage of {run.sinkage * 1e3:.4g} mm; give more"
+            )
         return _relaxed([run], reach, spacing)[0]
 
     return relax
@@ -400,9 +403,9 @@ def trimmed(profile: Profile, least: float) -> Profile:
 
 def _within(name: str, value: float, least: float, most: float, what: str) -> None:
     if not least <= value <= most:
-        raise ValueError(f"{name}: got {value!r}; give {what}")
+        raise ValueError(f"{name}: got {short(value)}; give {what}")
 
 
 def _above(name: str, value: float, what: str) -> None:
     if not (value > 0 and math.isfinite(value)):
-        raise ValueError(f"{name}: got {value!r}; give {what}")
+        raise ValueError(f"{name}: got {short(value)}; give {what}")

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsand.goals.writing import written
 from jaxsand.planning.pipeline import ShapeResult
 from jaxsand.scene.masked import gaps
 
@@ -122,8 +123,13 @@ class Page:
 
         Args:
           path: the file to write.
+
+        Raises:
+          ValueError: if it cannot be written; what was there stays.
         """
-        Path(path).write_text(self.html(), encoding="utf-8")
+        page = self.html()
+        with written(Path(path), "path") as beside:
+            beside.write_text(page, encoding="utf-8")
 
     def _repr_html_(self) -> str:
         """The page in a frame of a notebook."""

@@ -163,6 +163,11 @@ BAD = {
     "a seed below 0": (["shape", "L", "--method", "search", "--seed", "-1"], "seed: "),
     "weight of nothing": (["plan", "l.txt", "--weight", "2"], "weight: has no effect with engine 'auto'"),
     "turns beyond price": (["plan", "l.txt", "--turn-cost", "inf"], "turn_cost: got inf"),
+    "a name of blanks": (["settle", " ", "--out-file", "x.npy"], r"IN\.npy: got an empty name"),
+    "a name that is too long": (
+        ["settle", "x" * 300 + ".npy", "--out-file", "y.npy"],
+        "x{200}: no such file; check the name",
+    ),
     "unknown benchmark": (["bench", "everything"], "what: invalid choice"),
     "batch of none": (["bench", "settle", "--batch", "0"], "batch: got '0'"),
 }

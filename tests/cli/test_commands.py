@@ -317,18 +317,6 @@ def test_help_does_not_import_jax():
     assert "shape" in done.stdout
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path):
-    from jaxsand.cli.files import written
-
-    target = tmp_path / "result.json"
-    target.write_text("old")
-    with pytest.raises(ValueError, match="out: cannot write .*result.json"), written(target) as path:
-        path.write_text("half")
-        raise OSError(28, "No space left on device")
-    assert target.read_text() == "old"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["result.json"]
-
-
 @pytest.mark.wide
 def test_pictures_do_not_depend_on_the_users_matplotlib(tmp_path):
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\nimage.origin: lower\n")

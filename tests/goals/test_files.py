@@ -1,10 +1,12 @@
 """Height maps to files and back: every digit that a format promises, rows the right way up, holes where they were."""
 
 import struct
+import zipfile
 
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 import jaxsand as js
 
@@ -132,15 +134,75 @@ def test_a_printed_body_is_closed_and_holds_the_sand(tmp_path):
         (lambda f: js.HeightMap(HEIGHT, 0.0), "^spacing: got 0.0"),
         (lambda f: js.HeightMap(HEIGHT + np.inf, 1.0), "^height: got cells that are infinite"),
         (lambda f: js.HeightMap(HEIGHT, 1.0, (np.nan, 0.0)), "^corner: got"),
+        (lambda f: js.HeightMap(HEIGHT, "wide"), "^spacing: got 'wide'"),
+        (lambda f: js.HeightMap(HEIGHT, 10**400), "^spacing: got 1000"),
+        (lambda f: js.HeightMap(HEIGHT, 1.0, 3.0), "^corner: got 3.0; give x and y"),
+        (lambda f: js.HeightMap(HEIGHT, 1.0, (1.0, 2.0, 3.0)), "^corner: got"),
+        (lambda f: js.HeightMap(HEIGHT, 1.0, ([1.0, 2.0], [3.0])), "^corner: got"),
+        (lambda f: js.HeightMap([[1.0], [2.0, 3.0]], 1.0), "^height: got no array"),
+        (lambda f: js.HeightMap(HEIGHT + 1e300, 1.0), "^height: got cells more than 1e\\+12 m from 0"),
+        (lambda f: js.write_map(np.zeros(3), HEIGHT, spacing=1.0), "^path: got an array of shape"),
+        (lambda f: js.read_map(f / ("x" * 300 + ".asc")), "cannot be read as a height map: File name too long"),
+        (lambda f: js.read_map(f / "endless.asc"), "cannot be read as a height map: nrows is inf"),
     ],
 )
 def test_mistakes_are_named(tmp_path, act, message):
     (tmp_path / "bad.asc").write_text("ncols 2\nxllcorner 0\n")
     (tmp_path / "short.asc").write_text("ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n")
     (tmp_path / "huge.asc").write_text("ncols 1000000\nnrows 1000000\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n")
+    (tmp_path / "endless.asc").write_text("ncols 2\nnrows inf\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n")
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04rubbish")
     Image.new("L", (3, 2)).save(tmp_path / "plain.png")
     before = sorted(tmp_path.iterdir())
     with pytest.raises(ValueError, match=message):
         act(tmp_path)
     assert sorted(tmp_path.iterdir()) == before
+
+
+GRID = {"elevation": HEIGHT, "resolution": 0.1, "position": np.zeros(2)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"resolution": np.ones(2)}, "resolution is no number"),
+        ({"resolution": "x"}, "resolution is no number"),
+        ({"resolution": 1j}, "resolution is no number"),
+        ({"position": np.ones(3)}, "position is no list of 2 numbers"),
+        ({"position": 1.0}, "position is no list of 2 numbers"),
+        ({"elevation": HEIGHT[0]}, r"elevation has shape \[7\]"),
+        ({"elevation": 1.0}, r"elevation has shape \[\]"),
+        ({"elevation": np.array([["a"]])}, "height: got <U1 of shape"),
+    ],
+)
+def test_an_npz_that_is_no_height_map_is_named(tmp_path, change, message):
+    np.savez(tmp_path / "x.npz", **(GRID | change))
+    with pytest.raises(ValueError, match=f"x.npz: cannot be read as a height map: .*{message}"):
+        js.read_map(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("way", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_an_npz_packed_in_another_way_is_refused(tmp_path, way):
+    with zipfile.ZipFile(tmp_path / "x.npz", "w", way) as archive:
+        archive.writestr("elevation.npy", b"")
+    with pytest.raises(ValueError, match="elevation.npy is packed in a way that numpy does not use"):
+        js.read_map(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize(
+    "told", ["[]", "3", "{}", '{"spacing": "x"}', '{"spacing": 1e400}', '{"spacing": null}', "[" * 9999]
+)
+def test_a_picture_whose_notes_are_spoilt_is_named(tmp_path, told):
+    notes = PngInfo()
+    notes.add_text("jaxsand", told)
+    Image.fromarray(np.ones((2, 3), np.uint16)).save(tmp_path / "x.png", pnginfo=notes)
+    with pytest.raises(ValueError, match="x.png: cannot be read as a height map"):
+        js.read_map(tmp_path / "x.png")
+
+
+def test_a_npy_header_that_no_tokenizer_reads_is_named(tmp_path):
+    np.save(tmp_path / "x.npy", HEIGHT)
+    data = (tmp_path / "x.npy").read_bytes()
+    (tmp_path / "x.npy").write_bytes(data.replace(b"}", b"(", 1))
+    with pytest.raises(ValueError, match="x.npy: cannot be read as a height map"):
+        js.read_map(tmp_path / "x.npy", spacing=0.1)

@@ -81,6 +81,21 @@ BAD = {
     "push by number": (lambda: js.step(SAND, LEVEL, STROKE, push=3), "push: got 3"),
     "sub-step of two cells": (lambda: js.step(SAND, LEVEL, STROKE, push=js.SteppedPush(2.0)), r"push\.substep: got 2.0"),
     "minus one sweep": (lambda: js.step(SAND, LEVEL, STROKE, push=js.SteppedPush(0.5, -1)), r"push\.sweeps: got -1"),
+    "boundless numbers for sand": (lambda: js.settle(SAND, 10**400), "height: got int, no array of numbers"),
+    "boundless numbers for a stroke": (lambda: js.step(SAND, LEVEL, [10**400, 0, 0, 0]), "stroke: got list, no array of numbers"),
+    "a stroke of several lengths": (lambda: js.step(SAND, LEVEL, [[1, 2], [3]]), "stroke: got list, no array"),
+    "an array for a tool": (made(tool=np.eye(9)), r"tool: got an array of shape \[9, 9\]; give NoTool"),
+    "an array for a window": (made(window=np.eye(9)), r"window: got an array of shape \[9, 9\]"),
+    "an array for an edge": (made(edge=np.eye(9)), r"edge: got an array of shape \[9, 9\]"),
+    "walls for a floor": (made(base=js.Walls(np.eye(9, dtype=bool))), r"base: got Walls\(solid=array\(.*\.\.\.; give Deep"),
+    "spacings of several lengths": (made(spacing=[[1, 2], [3]]), r"spacing: got \[\[1, 2\], \[3\]\]; it must be one"),
+    "an array for a push": (lambda: js.step(SAND, LEVEL, STROKE, push=np.eye(9)), r"push: got an array of shape \[9, 9\]"),
+    "an array for a stop": (lambda: js.settle(SAND, LEVEL, stop=np.eye(9)), r"stop: got an array of shape \[9, 9\]"),
+    "a word for a sub-step": (lambda: js.step(SAND, LEVEL, STROKE, push=js.SteppedPush("x")), "push.substep: got 'x'"),
+    "an array for an environment": (lambda: js.make(np.eye(9)), r"name: got an array of shape \[9, 9\]"),
+    "boundless seconds for a plan": (lambda: js.plan(np.ones((2, 2), bool), seconds=10**400), "seconds: got 1000.*; give a number above 0"),
+    "an array for an engine": (lambda: js.plan(np.ones((2, 2), bool), engine=np.eye(9)), r"engine: got an array"),
+    "a start of several lengths": (lambda: js.plan(np.ones((2, 2), bool), [[1, 2], [3]]), r"start: got \[\[1, 2\], \[3\]\]"),
 }  # fmt: skip
 
 

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsand.bench.kept import known_rows
+from train.curves import curve
 from train.replay.her import Final, Future
 from train.runs import checkpoints, runs
 from train.runs.runs import learner_of, load, run
@@ -295,9 +297,59 @@ def test_a_learner_is_known_by_its_configuration_and_nothing_else_is_made():
         {"is": "train.replay.her:Future", "copied": 3},
         {},
         {"is": "jaxsand.goals:terrain"},
+        {"is": "train.replay.her:Future", "copies": "3"},
+        {"is": "train.replay.her:Future", "copies": None},
+        {"is": "train." * 10_000},
+        {"is": "train.replay.her:Future", "x" * 10_000: 3},
     ):
-        with pytest.raises(ValueError, match="config: "):
+        with pytest.raises(ValueError, match="config: ") as caught:
             checkpoints.restored(data)
+        assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    "about", ["[]", "3", "null", '{"chunk": "x"}', '{"chunk": 1.5}', '{"score": null}', '{"more": 1}', "{"]
+)
+def test_a_checkpoint_that_says_nonsense_of_its_run_is_named(tmp_path, about):
+    np.savez(tmp_path / "last.npz", about=np.array(about))
+    with pytest.raises(ValueError, match=r"run: cannot read .*last.npz .*; put a copy of best.npz in its place"):
+        checkpoints.where(tmp_path / "last.npz")
+
+
+@pytest.mark.parametrize("fault", [TypeError("a"), OverflowError("b"), MemoryError()])
+def test_a_learner_that_cannot_begin_is_named(tmp_path, monkeypatch, fault):
+    run(Tiny(), tmp_path, steps=1)
+
+    def init(self, seed):
+        raise fault
+
+    monkeypatch.setattr(Tiny, "init", init)
+    with pytest.raises(ValueError, match="run: cannot begin the learner in .*config.json .*; train anew"):
+        load(tmp_path, Tiny())
+
+
+@pytest.mark.parametrize("seed", ["true", "1.5", '"3"', "null"])
+def test_a_seed_that_is_none_is_named(tmp_path, seed):
+    (tmp_path / "config.json").write_text(f'{{"seed": {seed}, "learner": null}}')
+    with pytest.raises(ValueError, match="run: .*config.json is no run's"):
+        learner_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "row", ['{"kind": "train", "steps": 1e999}', '{"kind": "validate", "seconds": 1' + "0" * 400 + "}", "[" * 9999, "3"]
+)
+def test_metrics_that_are_spoilt_are_named(tmp_path, row):
+    (tmp_path / "metrics.jsonl").write_text('{"kind": "validate", "seconds": 1, "score": 1}\n' + row + "\n")
+    if "train" in row:
+        assert curve(tmp_path)["score"] == [1]
+        return
+    with pytest.raises(ValueError, match="run: cannot read .*metrics.jsonl"):
+        curve(tmp_path)
+
+
+def test_rows_of_a_bench_that_are_no_text_are_left_out(tmp_path):
+    (tmp_path / "rows.jsonl").write_bytes(b'{"a": 1}\n\xff\xfe\n' + b"[" * 9999 + b'\n{"a": 2}\n')
+    assert known_rows(tmp_path / "rows.jsonl", {"a"}) == [{"a": 1}, {"a": 2}]
 
 
 def test_progress_tells_the_rate_the_score_and_the_time_to_go(tmp_path):

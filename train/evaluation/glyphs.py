@@ -1,6 +1,5 @@
 """Sets of glyphs to judge learners by: the letters, unchanged and changed, any glyph file, and random strokes."""
 
-import json
 import math
 import string
 from collections.abc import Callable
@@ -12,12 +11,14 @@ import numpy as np
 from jaxsand.bench.stroke_goals import StrokeGoal, letters, letters_on_rough_sand, stroke_goal, turned_letters
 from jaxsand.goals import letters as goals
 from jaxsand.goals import metrics
+from jaxsand.goals.untrusted import read_json
 from jaxsand.goals.usual import usual_scene
 from jaxsand.scene.scene import Scene
 from jaxsand.scene.tools import Blade
 from train.imitation.plans import random_plans
 
 _SEED = 2_000_003
+_GLYPHS, _STROKES = 1000, 1000  # in a file, and of a glyph
 
 
 def read_glyphs(path: Path) -> list[StrokeGoal]:
@@ -26,18 +27,25 @@ def read_glyphs(path: Path) -> list[StrokeGoal]:
     Raises:
       ValueError: names the file or the glyph, and what is wrong.
     """
+    return [stroke_goal(name, metrics.place(strokes)) for name, strokes in read_strokes(path).items()]
+
+
+def read_strokes(path: Path) -> dict[str, np.ndarray]:
+    """The strokes [n, 4] of each glyph in a file by its name; see `read_glyphs`."""
     try:
-        table = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=tuple)
-    except (OSError, ValueError, RecursionError) as error:
-        why = type(error).__name__
-        raise ValueError(f"glyphs: cannot read {path} ({why}); give a JSON file of names and strokes") from None
-    if not isinstance(table, tuple) or not table:  # an object's pairs
+        table = read_json(path)
+    except ValueError as error:
+        raise ValueError(f"glyphs: cannot read {path} ({error}); give a JSON file of names and strokes") from None
+    if not isinstance(table, dict) or not table:
         raise ValueError(f"glyphs: got no glyph in {path}; give a JSON object of names and strokes")
-    names = [name for name, _ in table]
-    for name in names:
-        if not (name.strip() and name.isprintable()) or names.count(name) > 1:
+    if len(table) > _GLYPHS:
+        raise ValueError(f"glyphs: got {len(table)} of them in {path}; give at most {_GLYPHS}")
+    for name, strokes in table.items():
+        if not (name.strip() and name.isprintable()):
             raise ValueError(f"glyphs: got the name {name!r:.60}; give each glyph a name of its own that can be printed")
-    return [stroke_goal(name, metrics.place(goals.stroke_list("glyphs", name, strokes, 0, 1))) for name, strokes in table]
+        if isinstance(strokes, list) and len(strokes) > _STROKES:
+            raise ValueError(f"glyphs: {name!r:.60} has {len(strokes)} strokes; give at most {_STROKES}")
+    return {name: goals.stroke_list("glyphs", name, strokes, 0, 1) for name, strokes in table.items()}
 
 
 def _moved(scale: float, shift: float) -> list[StrokeGoal]:

@@ -8,18 +8,17 @@ the old one.
 import importlib
 import json
 import os
-import zipfile
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, get_type_hints
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.lib.npyio import NpzFile
+
+from jaxsand.goals.untrusted import read_arrays
+from jaxsand.goals.writing import reason
 
 State = Any
 """A pytree of arrays (typed keys too): parameters, optimiser, buffer, environments, key, counters; everything."""
@@ -27,7 +26,8 @@ State = Any
 _ABOUT, _STATE = "about", "state/"
 _OURS = ("train", "jaxsand")
 _OTHER = "use its own learner"
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error)
+_LONGEST = 200  # signs of a class's name
+_PLAIN: dict[Any, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,7 @@ def load(path: Path, like: State) -> tuple[State, At]:
       ValueError: if the file cannot be read, or holds something else.
     """
     leaves = _named(like)
-    with _opened(path) as data:
-        at = At(**json.loads(str(data[_ABOUT])))
-        arrays = {name: data[name] for name in data.files if name != _ABOUT}
+    at, arrays = _read(path)
     other = [name for name in sorted(leaves.keys() | arrays.keys()) if _kind(arrays.get(name)) != _kind(leaves.get(name))]
     if other:
         advice = {name: _advice(arrays.get(name), leaves.get(name)) for name in other}
@@ -90,23 +88,25 @@ def load(path: Path, like: State) -> tuple[State, At]:
 
 def where(path: Path) -> At:
     """Where the run was when it wrote this file; see `load`."""
-    with _opened(path) as data:
-        return At(**json.loads(str(data[_ABOUT])))
+    return _read(path, (_ABOUT,))[0]
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[NpzFile]:
-    """Opens a checkpoint; raises ValueError with advice if that fails."""
+def _read(path: Path, names: Collection[str] | None = None) -> tuple[At, dict[str, np.ndarray]]:
+    """What a checkpoint says of where the run was, and its arrays; raises ValueError with advice if it cannot be read."""
+    if not path.exists():
+        raise ValueError(f"run: there is no {path}; train first, or check the name")
     try:
-        with path.open("rb") as file, np.load(file) as data:
-            yield data
-    except FileNotFoundError:
-        raise ValueError(f"run: there is no {path}; train first, or check the name") from None
-    except _UNREADABLE as error:
+        arrays = read_arrays(path, names)
+        about = json.loads(str(arrays.pop(_ABOUT, None)))
+        at = At(**about)
+        if not all(isinstance(getattr(at, f.name), int if f.type is int else int | float) for f in fields(At)):
+            raise ValueError(f"{_ABOUT} holds {about!r:.60}")
+    except (ValueError, TypeError, RecursionError) as error:
         other = "best.npz" if path.name == "last.npz" else "last.npz"
         raise ValueError(
-            f"run: cannot read {path} ({type(error).__name__}); put a copy of {other} in its place, or train anew"
+            f"run: cannot read {path} ({reason(error)}); put a copy of {other} in its place, or train anew"
         ) from None
+    return at, arrays
 
 
 def unwritable(path: Path, error: OSError) -> ValueError:
@@ -138,6 +138,8 @@ def restored(data: Any) -> Any:
         return tuple(restored(x) for x in data)
     if not isinstance(data, dict):
         return data
+    if len(str(data.get("is"))) > _LONGEST:
+        raise ValueError(f"config: got {data['is']!r:.60}, which is no part of {' or '.join(_OURS)}; use a run's own file")
     module, _, name = str(data.get("is")).partition(":")
     if module.partition(".")[0] not in _OURS:
         raise ValueError(f"config: got {data.get('is')!r}, which is no part of {' or '.join(_OURS)}; use a run's own file")
@@ -145,11 +147,17 @@ def restored(data: Any) -> Any:
         kind = getattr(importlib.import_module(module), name)
         if not (isinstance(kind, type) and is_dataclass(kind)):
             raise TypeError("it is no dataclass")
-        return kind(**{field: restored(x) for field, x in data.items() if field != "is"})
+        made = {field: restored(x) for field, x in data.items() if field != "is"}
+        for field, hint in get_type_hints(kind).items():
+            if hint in _PLAIN and field in made and type(made[field]) not in _PLAIN[hint]:
+                raise TypeError(f"{field} is {made[field]!r:.40}")
+        return kind(**made)
     except ModuleNotFoundError as error:
         raise ValueError(f"config: {data['is']} needs {error.name}; run pip install 'jaxsand[train]'") from None
     except (ImportError, AttributeError, TypeError) as error:
-        raise ValueError(f"config: cannot make {data['is']} ({error}); use the version that the run was made with") from None
+        raise ValueError(
+            f"config: cannot make {data['is']} ({error!s:.200}); use the version that the run was made with"
+        ) from None
 
 
 def _named(state: State) -> dict[str, Any]:

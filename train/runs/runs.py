@@ -6,14 +6,13 @@ RUN/last.npz       the state to go on from
 RUN/best.npz       the state that validated best
 """
 
-import json
 import os
 import platform
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -21,6 +20,8 @@ from types import FrameType
 from typing import Any, BinaryIO, Literal, Protocol
 
 from jaxsand.cli.files import as_json, folder, progress, write_json
+from jaxsand.goals.untrusted import read_json
+from jaxsand.goals.writing import reason
 from jaxsand.scene.progress import Tell
 from train.runs.checkpoints import At, State, described, restored, save, unwritable, where
 from train.runs.checkpoints import load as load_state
@@ -110,13 +111,16 @@ def run(
         raise ValueError("minutes: got none, and no steps; give one of them")
     tell = tell or progress()
     began = time.monotonic()
-    state, at = _begin(learner, out, seed, resume)
-    started = began - at.seconds
+    there = _check_there(out, resume)
+    with ExitStack() as held:
+        held.enter_context(_alone(out))
+        state, at = _begin(learner, out, seed, there)
+        rows, asked = held.enter_context(_rows(out, at.rows)), held.enter_context(_asked_to_stop())
+        started = began - at.seconds
 
-    def spent() -> float:
-        return time.monotonic() - started
+        def spent() -> float:
+            return time.monotonic() - started
 
-    with _rows(out, at.rows) as rows, _asked_to_stop() as asked:
         chunk, best = at.chunk, at.score
         score: float | None = None
         begun, first, saved = spent(), chunk, time.monotonic()
@@ -164,7 +168,12 @@ def load(out: Path, learner: Learner, which: Literal["best", "last"] = "best") -
     Raises:
       ValueError: if there is none, it cannot be read, or it is another learner's.
     """
-    return load_state(out / f"{which}.npz", learner.init(_config(out)["seed"]))[0]
+    seed = _config(out)["seed"]
+    try:
+        like = learner.init(seed)
+    except Exception as error:  # fields that another version, or another hand, wrote may break it anywhere
+        raise ValueError(f"run: cannot begin the learner in {out / _CONFIG} ({reason(error)}); train anew") from None
+    return load_state(out / f"{which}.npz", like)[0]
 
 
 def learner_of(out: Path) -> Learner:
@@ -192,25 +201,51 @@ def seed_of(out: Path) -> int:
 def _config(out: Path) -> dict[str, Any]:
     """The configuration of the run in a folder."""
     path = out / _CONFIG
+    if not path.exists():
+        raise ValueError(f"run: there is none in {out}; train one: python -m train --help")
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"run: there is none in {out}; train one: python -m train --help") from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"run: cannot read {path} ({type(error).__name__}); train anew in another folder") from None
-    if not isinstance(config, dict) or not isinstance(config.get("seed"), int) or "learner" not in config:
+        config = read_json(path)
+    except ValueError as error:
+        raise ValueError(f"run: cannot read {path} ({error}); train anew in another folder") from None
+    if not isinstance(config, dict) or type(config.get("seed")) is not int or "learner" not in config:
         raise ValueError(f"run: {path} is no run's; it needs a learner and a seed; train anew in another folder")
     return config
 
 
-def _begin(learner: Learner, out: Path, seed: int, resume: bool) -> tuple[State, At]:
-    """The state to go on from, and where the run is."""
+def _check_there(out: Path, resume: bool) -> bool:
+    """Whether a run is in the folder, which can be written to; raises ValueError where `resume` does not go with that."""
     there = (out / _CONFIG).exists()
     if there and not resume:
         raise ValueError(f"out: there is a run in {out}; go on with --resume, or choose another folder")
     if resume and not there:
         raise ValueError(f"out: there is no run in {out} to go on with; leave --resume out, or check the name")
     folder(out)
+    return there
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Keeps other runs out of the folder, where the system can; raises ValueError if one is going on there."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    number = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"out: a run is going on in {out}; wait for its end, or choose another folder") from None
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(number)
+
+
+def _begin(learner: Learner, out: Path, seed: int, there: bool) -> tuple[State, At]:
+    """The state to go on from, and where the run is."""
     if there:
         _compare(_config(out), described(learner), seed, out)
     if not (out / _LAST).exists() and (out / _BEST).exists():

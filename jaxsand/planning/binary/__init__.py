@@ -4,7 +4,6 @@ The tool moves by one cell north, east, south or west and digs the cell that it 
 mended, so the walk stays on the goal's cells (arXiv:1908.02745, "Single Stroke").
 """
 
-import math
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -17,12 +16,14 @@ from jaxsand.planning.binary.board import Board, Cell, Problem, connected_pieces
 from jaxsand.planning.binary.exact import exact
 from jaxsand.planning.binary.paper import ALPHA, paper
 from jaxsand.planning.binary.plans import Plan, WalkFound, as_plan
+from jaxsand.scene.validation import short
 
 __all__ = ["Board", "Cell", "Engine", "Plan", "Problem", "connected_pieces", "make_problem", "plan"]
 
 Engine = Literal["auto", "paper", "astar", "exact", "anytime", "frontier"]
 _WIDTH = 16_384
 _UNLIMITED = 1 << 60
+_FAR = 1e18  # above every weight, bound and number of seconds
 _MOST = 1 << 27
 
 
@@ -122,8 +123,8 @@ def _layered(problem: Problem, bound: int | None) -> WalkFound:
 def _check(problem: Problem, engine: str, weight: float | None, bound: int | None, seconds: float | None) -> None:
     """Raises ValueError for an option that is wrong, or that the engine does not have."""
     engines = get_args(Engine)
-    if engine not in engines:
-        raise ValueError(f"engine: got {engine!r}; give one of {', '.join(engines)}")
+    if not isinstance(engine, str) or engine not in engines:
+        raise ValueError(f"engine: got {short(engine)}; give one of {', '.join(engines)}")
     for field, value, users in (
         ("weight", weight, ("paper", "astar")),
         ("bound", bound, ("auto", "paper", "astar", "exact", "frontier")),
@@ -132,9 +133,11 @@ def _check(problem: Problem, engine: str, weight: float | None, bound: int | Non
         if value is None:
             continue
         if engine not in users:
-            raise ValueError(f"{field}: has no effect with engine {engine!r}; leave it out, or use {' or '.join(users)}")
-        if not (isinstance(value, (int, float, np.number)) and 0 < value < math.inf):
-            raise ValueError(f"{field}: got {value!r}; give a number above 0")
+            raise ValueError(
+                f"{field}: has no effect with engine {short(engine)}; leave it out, or use {' or '.join(users)}"
+            )
+        if not (isinstance(value, (int, float, np.number)) and 0 < value <= _FAR):
+            raise ValueError(f"{field}: got {short(value)}; give a number above 0 and at most {_FAR:g}")
     if bound is not None and int(bound) != bound:
         raise ValueError(f"bound: got {bound}; give a whole number")
     if bound is not None and seconds is not None:
@@ -142,6 +145,6 @@ def _check(problem: Problem, engine: str, weight: float | None, bound: int | Non
     if engine == "frontier" and (len(problem.starts) > 1 or problem.end is not None):
         raise ValueError("start: 'frontier' needs one start and no end; give (row, column), or use another engine")
     if problem.turn_cost and engine in ("paper", "exact", "frontier"):
-        raise ValueError(f"turn_cost: {engine!r} does not know turns; use astar, anytime or auto")
+        raise ValueError(f"turn_cost: {short(engine)} does not know turns; use astar, anytime or auto")
     if engine == "astar" and len(problem.board.cells) > LARGEST:
         raise ValueError(f"map: got {len(problem.board.cells)} cells, too many for astar ({LARGEST}); use exact or anytime")

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import shortest_path
 
 from jaxsand.scene.masked import DIG, unmasked
+from jaxsand.scene.validation import short
 
 MOVES = {"N": (-1, 0), "E": (0, 1), "S": (1, 0), "W": (0, -1)}
 Cell = tuple[int, int]
@@ -96,22 +97,26 @@ def make_problem(dig: ArrayLike, start: ArrayLike | None = None, end: Cell | Non
     at = {cell: i for i, cell in enumerate(cells)}
     near = tuple(tuple(at[r + dr, c + dc] for dr, dc in MOVES.values() if (r + dr, c + dc) in at) for r, c in cells)
     if not (isinstance(turn_cost, (int, float, np.number)) and 0 <= turn_cost <= _DEAREST):
-        raise ValueError(f"turn_cost: got {turn_cost!r}; give what a change of heading costs in steps, 0 to {_DEAREST}")
+        raise ValueError(f"turn_cost: got {short(turn_cost)}; give what a change of heading costs in steps, 0 to {_DEAREST}")
     chosen = range(len(cells)) if start is None else [_index(at, "start", one) for one in _several("start", start)]
     goal = None
     if end is not None:
         ends = _several("end", end)
         if len(ends) > 1:
-            raise ValueError(f"end: got {end!r}; give (row, column) of one cell to dig")
+            raise ValueError(f"end: got {short(end)}; give (row, column) of one cell to dig")
         goal = _index(at, "end", ends[0])
     return Problem(Board(dig.shape, tuple(cells), near), tuple(dict.fromkeys(chosen)), goal, float(turn_cost))
 
 
 def _several(field: str, start: ArrayLike) -> list[Cell]:
     """A user's cell or cells as a list."""
-    given = np.asarray(unmasked(field, start, "give (row, column) of a cell to dig"))
+    cells = unmasked(field, start, "give (row, column) of a cell to dig")
+    try:
+        given = np.asarray(cells)
+    except (TypeError, ValueError, OverflowError):
+        given = np.empty(0)
     if given.ndim not in (1, 2) or given.shape[-1] != 2 or not given.size or given.dtype.kind not in "iu":
-        raise ValueError(f"{field}: got {start!r}; give (row, column) of a cell to dig")
+        raise ValueError(f"{field}: got {short(start)}; give (row, column) of a cell to dig")
     return [tuple(cell) for cell in given.reshape(-1, 2).tolist()]
 
 

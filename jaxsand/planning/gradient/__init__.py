@@ -23,6 +23,7 @@ from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.masked import POINTS
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene, as_array, blade_of
+from jaxsand.scene.validation import short
 
 _LANES = 4  # plans that go downhill together
 _STEPS = 6  # of Adam on blurred maps
@@ -83,7 +84,7 @@ class Blurred:
 
     def __post_init__(self) -> None:
         if not all(0 < c < math.inf for c in self.cells):
-            raise ValueError(f"smoothing.cells: got {self.cells!r}; give positive numbers, or smoothing=None")
+            raise ValueError(f"smoothing.cells: got {short(self.cells)}; give positive numbers, or smoothing=None")
 
 
 def optimise_strokes(
@@ -278,5 +279,5 @@ def _entropy(key: jax.Array | int) -> np.ndarray:
         key = jax.random.key_data(key)
     numbers = np.atleast_1d(np.asarray(key)).ravel()
     if numbers.dtype.kind not in "iu" or not len(numbers) or numbers.min() < 0:
-        raise ValueError(f"key: got {key!r}; give jax.random.key(0), or a whole number from 0 on")
+        raise ValueError(f"key: got {short(key)}; give jax.random.key(0), or a whole number from 0 on")
     return numbers

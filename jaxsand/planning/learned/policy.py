@@ -2,20 +2,20 @@
 
 import json
 import math
-import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
+from jaxsand.goals.untrusted import read_arrays
+from jaxsand.goals.writing import reason
 from jaxsand.planning.learned.network import Params, StrokeNet, judge, likeliest, symmetric
 from jaxsand.scene.scene import Scene, blade_of
 
@@ -25,6 +25,7 @@ SIDE = 32
 _STRIDE = 16  # between the looks at a larger map
 _SIZES = (1, 8, 64)  # of batches, so that a few programs serve all
 _FILE = "policy.npz"
+_WIDEST = 4096  # features of a network
 _REMEDY = (
     "reinstall jaxsand for the one that it ships, or train one in a checkout of its repository, which has the learners "
     "(python -m train hindsight)"
@@ -62,7 +63,7 @@ class Policy:
         found, scores = [], []
         for row, column in _looks(scene.grid.shape):
             a, b = (_part(x, row, column) for x in (goal, current))
-            strokes, score = in_batches(partial(_read, self.net, self.params, count), a, b, _SIZES)
+            strokes, score = in_batches(partial(_proposed, self.net, self.params, count), a, b, _SIZES)
             share = ((a - b) ** 2).sum((1, 2)) / np.maximum(undone, 1e-30)
             found.append(strokes + np.array([column, row, column, row], np.float32))
             scores.append(score + np.log(np.maximum(share, 1e-30))[:, None])
@@ -95,7 +96,9 @@ def in_batches(
 
 
 @partial(jax.jit, static_argnames=("net", "count"))
-def _read(net: StrokeNet, params: Params, count: int, goal: jax.Array, current: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _proposed(
+    net: StrokeNet, params: Params, count: int, goal: jax.Array, current: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """The `count` likeliest strokes [B, count, 4] (cells) and their scores [B, count]."""
     return likeliest(judge(net, params), symmetric(net, params, goal, current), count)
 
@@ -120,9 +123,8 @@ def load_policy(path: Path | None = None) -> Policy:
 
 def about_policy(path: Path | None = None) -> dict[str, Any]:
     """The notes of a policy's maker: the command, the minutes it took, and what it reached on goals of random strokes."""
-    with resources.as_file(resources.files("jaxsand").joinpath("data", _FILE)) as own, np.load(path or own) as data:
-        known: dict[str, Any] = json.loads(str(data["about"]))
-        return known
+    with resources.as_file(resources.files("jaxsand").joinpath("data", _FILE)) as own:
+        return _read(path or own, ("about",))[0]
 
 
 @cache
@@ -132,16 +134,43 @@ def _shipped() -> Policy:
 
 
 def _loaded(path: Path) -> Policy:
-    try:
-        with path.open("rb") as file, np.load(file) as data:
-            fields = json.loads(str(data["about"]))["net"]
-            flat = {name: jnp.asarray(data[name], jnp.float32) for name in data.files if name != "about"}
-        net = StrokeNet(tuple(fields["widths"]), tuple(fields["blocks"]), fields["features"], fields["sights"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
-        raise ValueError(f"policy: cannot read {path} ({type(error).__name__}); {_REMEDY}") from None
-    if {name: x.shape for name, x in flat.items()} != _shapes(net):
+    about, arrays = _read(path)
+    net = _net(about.get("net"), len(arrays))
+    if net is None or {name: x.shape for name, x in arrays.items()} != _shapes(net):
         raise ValueError(f"policy: {path} holds no parameters of this version's network; {_REMEDY}")
+    if other := next((name for name, x in arrays.items() if x.dtype.kind != "f" or not np.isfinite(x).all()), None):
+        raise ValueError(f"policy: {path} holds no finite numbers as {other}; {_REMEDY}")
+    flat = {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items()}
     return Policy(net, traverse_util.unflatten_dict(flat, sep="/"))
+
+
+def _read(path: Path, names: Collection[str] | None = None) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The notes in a policy's file, and its arrays."""
+    try:
+        arrays = read_arrays(path, names)
+        about = json.loads(str(arrays.pop("about", "null")))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"policy: cannot read {path} ({reason(error)}); {_REMEDY}") from None
+    if not isinstance(about, dict):
+        raise ValueError(f"policy: {path} says nothing about its network; {_REMEDY}")
+    return about, arrays
+
+
+def _net(fields: object, most: int) -> StrokeNet | None:
+    """The network of these fields, if it can be one; each block has more arrays than one, of `most` in all."""
+
+    def good(number: object, low: int, high: int) -> bool:
+        return isinstance(number, int) and not isinstance(number, bool) and low <= number <= high
+
+    if not isinstance(fields, dict):
+        return None
+    widths, blocks = (fields.get(name) for name in ("widths", "blocks"))
+    if not all(isinstance(some, list) and len(some) == 3 for some in (widths, blocks)):
+        return None
+    counts = [fields.get("features"), fields.get("sights"), *(widths or ())]
+    if not all(good(n, 1, _WIDEST) for n in counts) or not all(good(n, 0, most) for n in blocks or ()):
+        return None
+    return StrokeNet(tuple(widths or ()), tuple(blocks or ()), counts[0], counts[1])
 
 
 def _shapes(net: StrokeNet) -> dict[str, tuple[int, ...]]:

@@ -25,6 +25,7 @@ from jaxsand.relaxation.settling import check_at_rest
 from jaxsand.relaxation.stopping import check_whole
 from jaxsand.scene.scene import Scene, as_array, blade_of, fit
 from jaxsand.scene.tools import Blade, square
+from jaxsand.scene.validation import short
 
 _CHOICE = 0.25  # of the budget is for first plans with each of several blades
 
@@ -278,17 +279,17 @@ def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, se
     if isinstance(actions, Lattice):
         largest = max(scene.grid.shape) - 1
         if not 0 < actions.pitch <= largest:
-            raise ValueError(f"actions.pitch: got {actions.pitch!r}; give spacings, above 0 and at most {largest}")
+            raise ValueError(f"actions.pitch: got {short(actions.pitch)}; give spacings, above 0 and at most {largest}")
         if not actions.pitch <= max(actions.shortest, actions.pitch) <= min(actions.longest, largest):
             raise ValueError(
-                f"actions.longest: got {actions.longest!r} with shortest {actions.shortest!r} and pitch {actions.pitch!r}; "
-                f"give spacings with pitch and shortest at most longest, and at most {largest}"
+                f"actions.longest: got {short(actions.longest)} with shortest {short(actions.shortest)} and pitch "
+                f"{short(actions.pitch)}; give spacings with pitch and shortest at most longest, and at most {largest}"
             )
     elif isinstance(actions, Rising | Flat):
         across = math.hypot(*(n - 1 for n in scene.grid.shape))
         for name in ("shortest", "longest", "lowest", "highest"):
             if not isinstance(getattr(actions, name), int | float):
-                raise ValueError(f"actions.{name}: got {getattr(actions, name)!r}; give a number")
+                raise ValueError(f"actions.{name}: got {short(getattr(actions, name))}; give a number")
         if across < actions.shortest <= Rising.shortest:
             raise ValueError(
                 f"height: got {list(scene.grid.shape)} cells, too few for a stroke of {actions.shortest:.4g} spacings; "
@@ -296,12 +297,12 @@ def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, se
             )
         if not 0 < actions.shortest <= min(actions.longest, across):
             raise ValueError(
-                f"actions.shortest: got {actions.shortest!r} with longest {actions.longest!r}; "
+                f"actions.shortest: got {short(actions.shortest)} with longest {short(actions.longest)}; "
                 f"give spacings, above 0, at most longest, and at most {across:.4g}"
             )
         if not actions.lowest <= actions.highest or math.inf in (actions.lowest, -actions.highest):
             raise ValueError(
-                f"actions.lowest: got {actions.lowest!r} with highest {actions.highest!r}; "
+                f"actions.lowest: got {short(actions.lowest)} with highest {short(actions.highest)}; "
                 "give heights in metres, at most highest"
             )
     elif isinstance(actions, Steps):
@@ -313,4 +314,4 @@ def _check_options(scene: Scene, actions: Actions, strokes: int, budget: int, se
                 "fewer than two steps; give a smaller one"
             )
     else:
-        raise ValueError(f"actions: got {actions!r}; give Lattice(), Steps(), Rising() or Flat()")
+        raise ValueError(f"actions: got {short(actions)}; give Lattice(), Steps(), Rising() or Flat()")

@@ -1,0 +1,29 @@
+"""Files that are whole, or not there: written beside, then put in place."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def written(path: Path, field: str = "out") -> Iterator[Path]:
+    """A file beside `path` to write to, which takes its place when all went well.
+
+    Raises:
+      ValueError: with the field's name, if it cannot be written; what was there stays.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield beside
+        beside.replace(path)
+    except OSError as error:
+        raise ValueError(f"{field}: cannot write {path} ({reason(error)}); make room, or choose another folder") from None
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def reason(error: BaseException) -> str:
+    """What an error says, in a few words on a line."""
+    said = getattr(error, "strerror", None) or str(error.args[0] if isinstance(error, KeyError) and error.args else error)
+    return " ".join(said.split())[:80] or type(error).__name__
