@@ -22,6 +22,7 @@ HEAVY = {
         "viz.trenches",
         "viz.strokes",
         "viz.terminal",
+        "viz.history",
         "viz.side",
         "viz.gallery",
         "viz.plot",

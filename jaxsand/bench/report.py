@@ -28,6 +28,7 @@ from jaxsand.bench import (
     pushes,
     ramps,
     sand,
+    speed,
     stability,
     tasks,
     tools,
@@ -65,7 +66,7 @@ def bench(
     **options: Any,
 ) -> Row:
     """The figures for `what`: settle, push, plan, or all of these; env, grad, calibrate, sand, strokes, trench,
-    stability, letters, ramp, tasks, or tools.
+    stability, letters, ramp, tasks, tools, or speed.
 
     Speed is measured on maps of 32 x 32 cells; error against run time on `grids` grids of every scene (0 leaves it out).
     `batch` is 4096, for env 1024, for grad 64, for tools 16, unless given. `options` are those of
@@ -113,6 +114,7 @@ def bench(
     others: dict[str, Callable[[], Row]] = {
         "env": lambda: {"env": envs.bench_env(batch, tell)},
         "stability": lambda: {"stability": stability.stability(tell=tell)},
+        "speed": lambda: {"speed": speed.bench_speed(tell)},
         "letters": lambda: {"letters": bench_letters(tell)},
         "ramp": lambda: ramps.bench_ramps(tell, seed=seed),
         "tasks": lambda: tasks.bench_tasks(tell, seed=seed, **options),

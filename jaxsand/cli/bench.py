@@ -2,6 +2,7 @@
 
 import argparse
 import subprocess
+import sys
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -65,7 +66,21 @@ def run_benchmark(options: argparse.Namespace) -> None:
                     save_figure(lambda: found_figure(shown), path)
         write_json(out / f"bench-{options.what}.json", report)
     tell("")
+    if out and options.what == "speed":
+        _compare_speed(report, out)
     show(options, report, table)
+
+
+def _compare_speed(report: dict[str, Any], out: Path) -> None:
+    """Adds a run to the history of speed and draws that; says on standard error what has become slower."""
+    from jaxsand.bench.speed import history, with_history
+    from jaxsand.viz.history import history_figure
+    from jaxsand.viz.render import save_figure
+
+    for line in with_history(report["speed"], report, out):
+        print(f"warning: {line}", file=sys.stderr)
+    with written(out / "bench-speed.png") as path:
+        save_figure(lambda: history_figure(history(out)), path)
 
 
 def _commit() -> str | None:

@@ -162,6 +162,7 @@ def _bench(commands: Any) -> None:
             "ramp",
             "tasks",
             "tools",
+            "speed",
         ],
         default="all",
     )
