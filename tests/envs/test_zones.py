@@ -151,7 +151,7 @@ def test_without_zones_nothing_is_computed_for_them():
 @pytest.mark.parametrize(
     ("zones", "message"),
     [
-        (RIGHT, r"^zones: got array.*; give one of NoZones\(\.\.\.\), ClippedBy\(\.\.\.\), RefusedBy"),
+        (RIGHT, r"^zones: got an array of shape .*; give one of NoZones\(\.\.\.\), ClippedBy\(\.\.\.\), RefusedBy"),
         (envs.ClippedBy(RIGHT[:5]), r"^zones.cells: got bool of shape \[5, 16\]; give booleans of shape \[16, 16\]"),
         (envs.RefusedBy(RIGHT.astype(int)), "^zones.cells: got int64 of shape"),
         (envs.ClippedBy(np.ma.masked_where(RIGHT, RIGHT)), "^zones.cells: got 112 masked cells; say of each"),
