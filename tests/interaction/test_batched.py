@@ -40,9 +40,16 @@ def test_losses_and_gradients_are_those_of_each_map_alone():
 
 
 def test_what_is_not_clean_has_no_loss_and_no_gradient():
-    strokes = STROKES.copy()
-    strokes[3, 1] = np.nan
-    value, (by_height, by_stroke) = js.value_and_grad_batch(SAND, weighed, MAPS, strokes, WEIGHTS, chunk=2, **QUICK)
+    """A map that is not finite, of sand without a tool, whose gradient compiles in a tenth of the time."""
+    maps = MAPS.copy()
+    maps[3, 4, 4] = np.nan
+    seen = np.where(np.isnan(maps), 0, WEIGHTS)
+
+    def loss(height, weight):
+        return jnp.sum(jnp.where(weight == 0, 0, weight * height))
+
+    bare = js.make_scene((9, 9), 0.01, 0.5)
+    value, (by_height, by_stroke) = js.value_and_grad_batch(bare, loss, maps, STROKES, seen, chunk=2, stop=QUICK["stop"])
     for found in (value, by_height, by_stroke):
         bad = np.isnan(np.asarray(found).reshape(5, -1))
         assert bad[3].all()
