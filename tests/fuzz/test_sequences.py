@@ -274,7 +274,7 @@ SLOW = {
 
 
 def test_sequences_on_sand_with_a_floor_walls_and_a_draining_edge():
-    played(on(ALL), 30, 14)
+    played(on(ALL), 16, 12)
 
 
 def test_sequences_of_an_environment():

@@ -1,6 +1,7 @@
 """How many glyphs a policy gets right: alone, with look-ahead by the simulator, and after refinement by gradients."""
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from jaxsand.goals import metrics
 from jaxsand.goals.success import right, strict, strokes_right
 from jaxsand.planning.learned.beam_search import Proposes
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
+from jaxsand.planning.side_by_side import side_by_side
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.viz.strokes import found_figure
 
@@ -20,16 +22,22 @@ if TYPE_CHECKING:
 def evaluate(policy: Proposes, glyphs: list[StrokeGoal], stages: Stages, tell: Tell = quiet) -> dict[str, Any]:
     """Lets a policy push as often as each glyph has strokes, and judges the result (see `jaxsand.goals.success`).
 
+    All glyphs are pushed side by side, in batches of one simulator (see `jaxsand.planning.side_by_side`).
+
     Returns:
       How many glyphs are `right` and `strict`, how many there are (`total`), how many have at least one right stroke
       (`stroke_right`), the figures of each by name (`glyphs`), and the `seconds`.
     """
     began = time.perf_counter()
-    rows = {}
-    for number, glyph in enumerate(glyphs, 1):
-        tell(f"{glyph.name}, {number} of {len(glyphs)}")
+
+    def row(number: int, glyph: StrokeGoal) -> dict[str, Any]:
         plan = plan_by_policy(policy, glyph.sand, len(glyph.strokes), stages)
-        rows[glyph.name] = judged(glyph, plan.strokes)
+        figures = judged(glyph, plan.strokes)
+        tell(f"{glyph.name}, {number} of {len(glyphs)}: {'right' if figures['right'] else 'not right'}")
+        return figures
+
+    found = side_by_side([partial(row, number, glyph) for number, glyph in enumerate(glyphs, 1)])
+    rows = {glyph.name: figures for glyph, figures in zip(glyphs, found, strict=True)}
     return {
         "right": sum(row["right"] for row in rows.values()),
         "strict": sum(row["strict"] for row in rows.values()),
