@@ -4,7 +4,8 @@ import string
 
 from jaxsand.bench.tables import Row
 from jaxsand.goals import letters
-from jaxsand.planning.pipeline import Layout, glyph_target, map_target, shape
+from jaxsand.planning.pipeline import glyph_target, shape
+from jaxsand.planning.targets import Layout, map_target
 from jaxsand.scene.progress import Tell, quiet
 
 

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
     from jaxsand.planning.gradient import Optimised
     from jaxsand.planning.learned.stages import Planned
-    from jaxsand.planning.pipeline import ShapeResult, Target
+    from jaxsand.planning.pipeline import ShapeResult
     from jaxsand.planning.search import SandPlan
+    from jaxsand.planning.targets import Target
 
 _FILES = ("result.json", "shape.png", "shape.gif")
 _STROKES, _PUSHES = 24, 2000  # of a search for strokes that rise and sink, unless told otherwise

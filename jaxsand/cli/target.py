@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from jaxsand.goals.goal import Goal
-    from jaxsand.planning.pipeline import Layout, Target
+    from jaxsand.planning.targets import Layout, Target
 
 RESOLUTION = 6
 """Grid cells to a block's side, unless told otherwise."""
@@ -28,7 +28,7 @@ _DEEP = 7.5  # mm: as deep as a blade goes unless told otherwise, into a goal th
 def read_target(options: argparse.Namespace) -> "Target":
     """The goal of `jaxsand shape`, in its scene; with strokes only where they need no search."""
     from jaxsand.goals import letters
-    from jaxsand.planning import pipeline
+    from jaxsand.planning import pipeline, targets
 
     name, method = options.goal, options.method
     path = Path(name)
@@ -60,16 +60,14 @@ def read_target(options: argparse.Namespace) -> "Target":
             f"goal: got {name!r}; give a letter A to Z, a .txt, .png, .npy or .json file, or terrain, "
             "or push any text by its own strokes with --method strokes"
         )
-    return pipeline.map_target(
-        dig, start if options.start else own, path.stem if is_file else name.upper(), _layout(options)
-    )
+    return targets.map_target(dig, start if options.start else own, path.stem if is_file else name.upper(), _layout(options))
 
 
 def _surface_target(options: argparse.Namespace) -> "Target":
     """The goal that a picture, heights, a drawing or the terrain is; with strokes only where the method is to plan them."""
     from jaxsand.goals import letters, surfaces
     from jaxsand.goals.goal import Goal
-    from jaxsand.planning import pipeline
+    from jaxsand.planning import targets
 
     name, path, planned = options.goal, Path(options.goal), options.method == "plan"
     if options.start:
@@ -78,10 +76,10 @@ def _surface_target(options: argparse.Namespace) -> "Target":
         if options.method in ("optimise", "policy"):
             raise _drawn(options)
         layout = _layout(options)
-        heights = pipeline.image_goal(letters.read_image(existing(path)), layout, _cells(options))
+        heights = targets.image_goal(letters.read_image(existing(path)), layout, _cells(options))
         if planned:
-            return pipeline.height_target(heights, "image", path.stem, layout)
-        return pipeline.height_goal(Goal(heights, above=(heights < 0) * 1.0), "image", path.stem, layout)
+            return targets.height_target(heights, "image", path.stem, layout)
+        return targets.height_goal(Goal(heights, above=(heights < 0) * 1.0), "image", path.stem, layout)
     if path.suffix.lower() == ".json":
         return _drawing_target(path, options)
     if name == "terrain":
@@ -91,7 +89,7 @@ def _surface_target(options: argparse.Namespace) -> "Target":
     else:
         heights = _goal_heights(path, options)
         layout = _layout(options, _DEEP if planned else _deep_enough(heights, options.method))
-    make = pipeline.height_target if planned else pipeline.height_goal
+    make = targets.height_target if planned else targets.height_goal
     return make(heights, "terrain" if name == "terrain" else "heights", path.stem, layout)
 
 
@@ -102,7 +100,7 @@ def _drawing_target(path: Path, options: argparse.Namespace) -> "Target":
     import numpy as np
 
     from jaxsand.goals.drawing import SHEET, as_drawing
-    from jaxsand.planning import pipeline
+    from jaxsand.planning import targets
     from jaxsand.scene.scene import make_scene
 
     drawing = as_drawing(existing(path))
@@ -115,8 +113,8 @@ def _drawing_target(path: Path, options: argparse.Namespace) -> "Target":
     depth = _DEEP if planned else _deep_enough(np.asarray(goal.height), options.method)
     layout = replace(_layout(options, depth), spacing=drawing.grid.spacing)
     if planned:
-        return pipeline.height_target(_planned(goal), "drawing", path.stem, layout)
-    return pipeline.height_goal(goal, "drawing", path.stem, layout)
+        return targets.height_target(_planned(goal), "drawing", path.stem, layout)
+    return targets.height_goal(goal, "drawing", path.stem, layout)
 
 
 def _planned(goal: "Goal") -> "np.ndarray":
@@ -230,7 +228,7 @@ def _deep_enough(heights: "np.ndarray", method: str) -> float:
 
 
 def _layout(options: argparse.Namespace, depth_mm: float = 3.0) -> "Layout":
-    from jaxsand.planning.pipeline import Layout
+    from jaxsand.planning.targets import Layout
 
     depth = depth_mm if options.depth_mm is None else options.depth_mm
     spacing = _SPACING if options.spacing is None else options.spacing

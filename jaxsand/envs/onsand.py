@@ -13,7 +13,7 @@ from jaxsand.envs.spaces import Box, Dict, Discrete
 from jaxsand.goals import metrics
 from jaxsand.interaction.simulate import act
 from jaxsand.interaction.stepped import SteppedPush
-from jaxsand.planning.pipeline import Layout
+from jaxsand.planning.targets import Layout
 from jaxsand.scene.footprint import Pose, coverage
 from jaxsand.scene.grid import centres
 from jaxsand.scene.scene import Scene, blade_of

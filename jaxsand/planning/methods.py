@@ -8,10 +8,11 @@ import numpy as np
 from jaxsand.planning.gradient import Optimised, optimise_strokes
 from jaxsand.planning.learned.policy import load_policy
 from jaxsand.planning.learned.stages import Planned, Stages, plan_by_policy
-from jaxsand.planning.pipeline import Target, at_rest
+from jaxsand.planning.pipeline import at_rest
 from jaxsand.planning.search import SandPlan, plan_sand
 from jaxsand.planning.search.actions import Lattice, Rising
 from jaxsand.planning.stroke_loss import sand_loss
+from jaxsand.planning.targets import Target
 from jaxsand.scene.progress import Tell
 from jaxsand.scene.scene import Scene, blade_of
 from jaxsand.scene.tools import Blade

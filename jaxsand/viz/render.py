@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsand.planning.binary import Plan
-from jaxsand.planning.pipeline import ShapeResult, Target
+from jaxsand.planning.pipeline import ShapeResult
+from jaxsand.planning.targets import Target
 
 if TYPE_CHECKING:
     from collections.abc import Callable

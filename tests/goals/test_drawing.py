@@ -12,7 +12,8 @@ import jaxsand as js
 from jaxsand.goals import outlines
 from jaxsand.goals.drawing import as_drawing
 from jaxsand.goals.surfaces import places
-from jaxsand.planning.pipeline import Layout, _figures, height_goal
+from jaxsand.planning.pipeline import _figures
+from jaxsand.planning.targets import Layout, height_goal
 from jaxsand.scene.grid import Grid
 
 SCENE = js.make_scene((12, 16), 0.01)

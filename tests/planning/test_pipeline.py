@@ -10,7 +10,7 @@ import pytest
 import jaxsand as js
 from jaxsand.goals import letters, metrics, surfaces
 from jaxsand.goals.metrics import volume_error
-from jaxsand.planning import pipeline
+from jaxsand.planning import pipeline, targets
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
 
@@ -25,7 +25,7 @@ def shape(target, before=None):
 @pytest.mark.parametrize("letter", ["A", *(pytest.param(letter, marks=pytest.mark.slow) for letter in "SQ")])
 def test_a_letter_map_is_trenched(letter):
     dig, start = letters.letter_map(letter)
-    result = shape(pipeline.map_target(dig, start, letter, pipeline.Layout()))
+    result = shape(targets.map_target(dig, start, letter, targets.Layout()))
     assert result.figures["iou"] > 0.84  # a reversal is half a turn, which sweeps: A, with two of them, has 0.849
     assert result.figures["l2_reduction"] > 0.6
     assert result.figures["volume_error"] <= 1e-6
@@ -43,7 +43,7 @@ LETTERS = [pytest.param(a, marks=() if a in "IT" else pytest.mark.slow) for a in
 @pytest.mark.parametrize("letter", LETTERS)
 def test_every_letter_runs(letter):
     dig, start = letters.letter_map(letter)
-    result = shape(pipeline.map_target(dig, start, letter, pipeline.Layout()))
+    result = shape(targets.map_target(dig, start, letter, targets.Layout()))
     assert result.figures["iou"] >= 0.7
     assert result.target.optimal
     own = shape(pipeline.glyph_target(letters.letter_strokes(letter), letter))
@@ -54,7 +54,7 @@ def test_every_letter_runs(letter):
 @pytest.mark.parametrize("letter", string.ascii_uppercase)
 def test_every_letter_is_planned(letter):
     dig, start = letters.letter_map(letter)
-    assert pipeline.map_target(dig, start, letter, pipeline.Layout()).optimal
+    assert targets.map_target(dig, start, letter, targets.Layout()).optimal
 
 
 def test_a_glyph_pushed_by_its_own_strokes_is_its_goal():
@@ -71,8 +71,8 @@ def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
     picture = np.zeros((20, 40))
     picture[4:16, 4:10] = -1
     picture[4:16, 28:34] = -1
-    layout = pipeline.Layout(margin=6)
-    result = shape(pipeline.height_target(pipeline.image_goal(picture, layout, 48), "image", "two", layout))
+    layout = targets.Layout(margin=6)
+    result = shape(targets.height_target(targets.image_goal(picture, layout, 48), "image", "two", layout))
     assert result.lifted
     assert len(result.target.paths) == 2
     assert result.figures["iou"] > 0.5
@@ -81,7 +81,7 @@ def test_a_picture_in_two_pieces_is_dug_in_two_strokes():
 @pytest.mark.wide
 def test_a_rough_surface_is_settled_first():
     dig, start = letters.letter_map("L")
-    target = pipeline.map_target(dig, start, "L", pipeline.Layout())
+    target = targets.map_target(dig, start, "L", targets.Layout())
     land = surfaces.terrain_surface(target.scene.grid.shape, 0.006)
     assert np.ptp(land) == pytest.approx(0.006)
     result = shape(target, land)
@@ -92,30 +92,30 @@ def test_a_rough_surface_is_settled_first():
 
 @pytest.mark.wide
 def test_terrain_as_a_goal():
-    layout = pipeline.Layout(depth=0.0075)
-    result = shape(pipeline.height_target(surfaces.terrain_surface((48, 48), 0.03), "terrain", "terrain", layout))
+    layout = targets.Layout(depth=0.0075)
+    result = shape(targets.height_target(surfaces.terrain_surface((48, 48), 0.03), "terrain", "terrain", layout))
     assert not result.target.drawn
     assert result.figures["l2_reduction"] == result.figures["l2_reduction_with_berms"]
     assert result.figures["iou"] > 0.3
 
 
 def test_goals_that_cannot_be_dug():
-    layout = pipeline.Layout()
+    layout = targets.Layout()
     with pytest.raises(ValueError, match="nothing to dig"):
-        pipeline.height_target(np.zeros((12, 12)), "heights", "flat", layout)
+        targets.height_target(np.zeros((12, 12)), "heights", "flat", layout)
     with pytest.raises(ValueError, match="fewer than the 6"):
-        pipeline.height_target(-np.ones((4, 12)), "heights", "small", layout)
+        targets.height_target(-np.ones((4, 12)), "heights", "small", layout)
     with pytest.raises(ValueError, match="1 cells that are not finite"):
         goal = -np.ones((12, 12))
         goal[8, 8] = np.inf
-        pipeline.height_target(goal, "heights", "broken", layout)
+        targets.height_target(goal, "heights", "broken", layout)
 
 
 def test_what_is_left_over_of_blocks_is_planned_too():
     goal = np.zeros((53, 53))
     goal[10:16, 6:46] = goal[48:53, 6:46] = -0.0075
-    layout = pipeline.Layout(depth=0.0075)
-    found = pipeline.height_target(goal, "heights", "two", layout)
+    layout = targets.Layout(depth=0.0075)
+    found = targets.height_target(goal, "heights", "two", layout)
     assert len(found.paths) == 2
     assert found.missed == 40  # the trench's first row lies in a block of which it is a sixth
     assert found.optimal is found.lower_bound is None
@@ -124,7 +124,7 @@ def test_what_is_left_over_of_blocks_is_planned_too():
     for side in range(6, 40):  # no path misses what lies at an edge, and the blade covers every block
         goal = np.zeros((side, 18))
         goal[-min(6, 2 * side // 3) :] = -0.0075
-        (path,) = pipeline.height_target(goal, "heights", "edge", layout).paths
+        (path,) = targets.height_target(goal, "heights", "edge", layout).paths
         reach = layout.oversize * layout.cell * layout.spacing / 2
         assert path[:, 1].max() + reach >= side * layout.spacing - 1e-9
         assert path[:, 1].max() < side * layout.spacing
@@ -132,15 +132,15 @@ def test_what_is_left_over_of_blocks_is_planned_too():
 
 def test_what_is_left_out_of_a_goal_is_counted_and_nothing_proven():
     """A trench half in each of two rows of blocks, and one of two cells, beside one that fills its blocks."""
-    layout = pipeline.Layout(depth=0.0075)
+    layout = targets.Layout(depth=0.0075)
     goal = np.zeros((48, 48))
     goal[6:12, 6:30] = -0.0075
-    whole = pipeline.height_target(goal, "heights", "whole", layout)
+    whole = targets.height_target(goal, "heights", "whole", layout)
     assert (whole.missed, whole.optimal, whole.lower_bound) == (0, True, 3)
     for second in (slice(27, 33), slice(26, 28)):
         more = goal.copy()
         more[second, 6:30] = -0.0075
-        found = pipeline.height_target(more, "heights", "more", layout)
+        found = targets.height_target(more, "heights", "more", layout)
         passed = (second.stop - second.start) * 24
         assert (found.missed, found.optimal, found.lower_bound) == (passed, None, None)
         assert np.array_equal(found.paths[0], whole.paths[0])
@@ -149,7 +149,7 @@ def test_what_is_left_out_of_a_goal_is_counted_and_nothing_proven():
 def test_blocks_of_whole_cells_lie_as_ever():
     goal = np.zeros((24, 30))
     goal[6:12, 12:24] = -0.0075
-    (path,) = pipeline.height_target(goal, "heights", "slot", pipeline.Layout(depth=0.0075)).paths
+    (path,) = targets.height_target(goal, "heights", "slot", targets.Layout(depth=0.0075)).paths
     assert np.allclose(path, [[0.15, 0.09], [0.21, 0.09]]) or np.allclose(path, [[0.21, 0.09], [0.15, 0.09]])
 
 
@@ -158,7 +158,7 @@ def test_a_recording_takes_no_more_memory_than_its_frames(monkeypatch):
     shown, and their number is bounded."""
     scene = make_scene((40, 40), 0.01, tool=Blade())
     to_and_fro = np.stack([0.1 + 0.1 * (np.arange(97) % 2), np.full(97, 0.2)], 1)
-    target = pipeline.Target(
+    target = targets.Target(
         "many", "heights", "plan", scene, np.zeros((40, 40)), (to_and_fro, *[to_and_fro[:3]] * 40), True, 0.0
     )
 
@@ -186,7 +186,7 @@ def test_a_recording_takes_no_more_memory_than_its_frames(monkeypatch):
 
 def test_one_push_gives_a_strokes_result_and_its_recording(monkeypatch):
     stroke, level = [0.08, 0.1, 0.2, 0.16], np.zeros((32, 32), np.float32)
-    target = pipeline.Target("one", "glyph", "strokes", GLYPHS, level, (np.reshape(stroke, (2, 2)),), False, 0.0075)
+    target = targets.Target("one", "glyph", "strokes", GLYPHS, level, (np.reshape(stroke, (2, 2)),), False, 0.0075)
     usual, pushes = pipeline._program, []
 
     def program(scene, points, columns):
