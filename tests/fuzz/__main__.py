@@ -27,7 +27,7 @@ def one(name: str, number: int, folder: Path, seed: int = 0) -> str:
     """Runs a case of an entrance in an empty folder; returns "ok" or what was said to be wrong. BrokenError if it is broken."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode()), number])
     warned = "ignore" if name.startswith("call-") else "error"  # numpy's of numbers that a caller gave
-    return judged(ENTRANCES[name](rng, folder), LIMITS.get(name, 10.0), warned)
+    return judged(ENTRANCES[name](rng, folder), LIMITS.get(name, 60.0), warned)
 
 
 def main() -> int:
