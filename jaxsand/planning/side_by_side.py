@@ -2,15 +2,15 @@
 
 A push of sixteen maps takes little longer than one of a single map. A search pushes a few maps at a time, and
 looks at them before it goes on; so many searches, each for a goal of its own, go on together. Every search runs in a thread.
-What it asks of the simulator waits until all others that have not ended have asked as well; then what most of them ask is
-answered, and the few wait until more ask the same. So the batches, and with them the results, do not depend on which thread
-is faster.
+What it asks of the simulator waits until all others that have not ended have asked as well. Then the kind of call that most
+of them wait for is made, and the others wait until more have come to the same. So the batches do not depend on which thread
+is faster; nor do the results, unless a search looks at a clock.
 """
 
 import threading
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -22,6 +22,8 @@ from jaxsand.autodiff.while_loop import Tree
 from jaxsand.scene.scene import Scene
 
 Found = TypeVar("Found")
+_SEARCHES = 64  # side by side at most
+_MAPS = 4096  # in a batch at most, but for a single search that asks for more
 
 
 @dataclass
@@ -32,6 +34,7 @@ class _Question:
     scene: Scene
     arrays: tuple[np.ndarray, ...]
     answer: Tree = None
+    answered: bool = False
 
     @property
     def kind(self) -> Hashable:
@@ -39,6 +42,10 @@ class _Question:
         leaves, shape = jax.tree.flatten(self.scene)
         numbers = tuple((x.dtype.str, x.shape, x.tobytes()) for x in map(np.asarray, leaves))
         return self.function, shape, numbers, tuple((x.dtype.str, x.shape[1:]) for x in self.arrays)
+
+
+class _StoppedError(Exception):
+    """Another search has failed."""
 
 
 @dataclass
@@ -55,22 +62,22 @@ class _Crowd:
         with self.changed:
             self.asked[who] = question
             self._answer_if_complete()
-            self.changed.wait_for(lambda: question.answer is not None or self.error is not None)
+            self.changed.wait_for(lambda: question.answered or self.error is not None)
             if self.error is not None:
-                raise self.error
+                raise _StoppedError
             return question.answer
 
-    def leave(self, error: BaseException | None = None) -> None:
-        """A search has ended, perhaps by an error; it is not waited for any longer."""
+    def leave(self) -> None:
+        """A search has ended; it is not waited for any longer."""
         with self.changed:
             self.running -= 1
-            self.stop(error)
             self._answer_if_complete()
 
-    def stop(self, error: BaseException | None) -> None:
-        """Lets all that ask from now on raise the error, unless there was one before."""
+    def stop(self, error: BaseException) -> None:
+        """Ends all searches at their next question; the first error is kept."""
+        if self.error is None and not isinstance(error, _StoppedError):
+            self.error = error  # seen without the lock too, which a batch that is being computed holds
         with self.changed:
-            self.error = self.error or error
             self.changed.notify_all()
 
     def _answer_if_complete(self) -> None:
@@ -79,10 +86,12 @@ class _Crowd:
         kinds: dict[Hashable, list[int]] = {}
         for who, question in sorted(self.asked.items()):
             kinds.setdefault(question.kind, []).append(who)
+        most = max(kinds.values(), key=len)
+        maps = np.cumsum([len(self.asked[who].arrays[0]) for who in most])
         try:
-            _answer([self.asked.pop(who) for who in max(kinds.values(), key=len)])
+            _answer([self.asked.pop(who) for who in most[: max(1, int((maps <= _MAPS).sum()))]])
         except BaseException as error:
-            self.error = error
+            self.error = self.error or error
         self.changed.notify_all()
 
 
@@ -90,13 +99,20 @@ _PLACE: ContextVar[tuple[_Crowd, int] | None] = ContextVar("place", default=None
 
 
 def side_by_side(searches: Sequence[Callable[[], Found]]) -> list[Found]:
-    """What each of the searches returns; their calls of `in_one_batch` are answered together.
+    """What each of the searches returns; their calls of `in_one_batch` are answered together, of up to 64 at a time.
+
+    A search sees the caller's context variables, and of JAX's settings for a thread `jax_enable_x64` alone.
 
     Raises:
       Exception: what the first search that failed has raised; the others then end at their next call.
     """
     if len(searches) < 2:
         return [search() for search in searches]
+    parts = [searches[k : k + _SEARCHES] for k in range(0, len(searches), _SEARCHES)]
+    return [found for part in parts for found in _together(part)]
+
+
+def _together(searches: Sequence[Callable[[], Found]]) -> list[Found]:
     crowd = _Crowd(len(searches))
     x64 = jnp.result_type(float) == jnp.float64  # which may hold for this thread alone
 
@@ -104,20 +120,20 @@ def side_by_side(searches: Sequence[Callable[[], Found]]) -> list[Found]:
         _PLACE.set((crowd, who))
         try:
             with jax.enable_x64(x64):
-                found = search()
-        except BaseException as error:
-            crowd.leave(error)
-            raise
-        crowd.leave()
-        return found
-
-    with ThreadPoolExecutor(len(searches)) as pool:  # a thread for each, as all wait for each other
-        ends = [pool.submit(run, who, search) for who, search in enumerate(searches)]
-        try:
-            return [end.result() for end in ends]
+                return search()
         except BaseException as error:
             crowd.stop(error)
             raise
+        finally:
+            crowd.leave()
+
+    with ThreadPoolExecutor(len(searches)) as pool:  # a thread for each, as all wait for each other
+        try:
+            ends = [pool.submit(copy_context().run, run, who, search) for who, search in enumerate(searches)]
+            return [end.result() for end in ends]
+        except BaseException as error:
+            crowd.stop(error)
+    raise crowd.error or _StoppedError
 
 
 def in_one_batch(function: Callable[..., Tree], scene: Scene, *arrays: np.ndarray) -> Tree:
@@ -144,3 +160,4 @@ def _answer(alike: list[_Question]) -> None:
     for question in alike:
         begin, end = end, end + len(question.arrays[0])
         question.answer = jax.tree.map(lambda x, part=slice(begin, end): x[part], found)
+        question.answered = True

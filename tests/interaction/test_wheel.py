@@ -201,7 +201,11 @@ def test_a_map_of_one_cell(push):
         assert np.array_equal(run(np.array(stroke)), [[0.0]])
 
 
-@pytest.fixture(scope="module", params=[pytest.param(STEPPED, marks=pytest.mark.slow), SPLIT], ids=["stepped", "split"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(STEPPED, marks=[pytest.mark.slow, pytest.mark.compiled]), SPLIT],
+    ids=["stepped", "split"],
+)
 def fenced(request):
     """Paths of four points on a map that drains and may hold walls, in float32: results, checked."""
     program = quick(lambda sand, h, path: js.follow(sand, h, path, push=request.param))

@@ -1,5 +1,6 @@
 """Searches side by side find what each finds alone, in fewer calls of the simulator; and an error ends them all."""
 
+import threading
 from dataclasses import replace
 from functools import partial
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
+from jaxsand.planning import side_by_side as side_by_side_module
 from jaxsand.planning.side_by_side import in_one_batch, side_by_side
 
 SCENE = js.make_scene((8, 8), 0.01, tool=js.Blade())
@@ -93,3 +95,41 @@ def test_what_most_ask_is_answered_first_and_the_few_join_later():
     side_by_side([ahead, behind, behind])
     assert [n for _, n in simulator.batches] == [3, 3]
     assert lifted == [2]
+
+
+def test_a_batch_has_no_more_maps_than_fit(monkeypatch):
+    monkeypatch.setattr(side_by_side_module, "_MAPS", 3)
+    monkeypatch.setattr(side_by_side_module, "_SEARCHES", 3)
+    simulator = Simulator()
+    found = side_by_side([partial(search, simulator, SCENE, 2, size, size) for size in (1, 2, 5, 1, 1)])
+    assert [len(maps) for maps in found] == [1, 2, 5, 1, 1]
+    assert [n for _, n in simulator.batches] == [3, 3, 5, 5, 2, 2]
+
+
+def test_a_thread_that_cannot_be_started_ends_all(monkeypatch):
+    simulator, started, usual = Simulator(), [], threading.Thread.start
+
+    def start(self):
+        started.append(self)
+        if len(started) > 2:
+            raise RuntimeError("can't start new thread")
+        usual(self)
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        side_by_side([partial(search, simulator, SCENE, 3, 1, 0)] * 4)
+    assert not simulator.batches
+
+
+def test_nothing_is_an_answer_and_the_callers_context_is_seen():
+    asked = []
+
+    def nothing(scene, maps):
+        asked.append(len(maps))
+
+    def one():
+        return in_one_batch(nothing, SCENE, np.zeros((1, 2, 2))), np.geterr()["over"]
+
+    with np.errstate(over="raise"):
+        assert side_by_side([one, one]) == [(None, "raise")] * 2
+    assert asked == [2]
