@@ -27,18 +27,24 @@ from jaxsand.scene.progress import Tell, quiet
 HISTORY = "speed.jsonl"
 """The file of all runs, a line each: commit, date, machine, and the figures."""
 
+LETTER = np.array([[cell == "#" for cell in row] for row in ("#####", "#....", "#####", "....#", "#####")])
+"""What is planned."""
+
 _REFERENCE = "reference"
+_FIGURES = ("ratio", "compile_ratio")
 _LAST = 10  # runs that a new one is compared with
 _FEWEST = 3  # with fewer nothing is told
 _SLOWER, _SPREADS = 1.3, 3.0  # times the median, and standard deviations above it, from which on it is told
 _LOOSE = 0.05  # of the median: what the spread is taken for at least
+_COMPILES = 10.0  # times the reference loop: a first call that takes less beyond the others does not compile
 
 
 def bench_speed(tell: Tell = quiet, rounds: int = 5) -> list[Row]:
     """The best time of each job, and what its first call took beyond that, over the best time of the reference loop.
 
     Returns:
-      Rows `name`, `ratio` and `compile_ratio`, and `seconds` and `compile_seconds` to look at.
+      Rows `name`, `ratio` and `compile_ratio`, which is None for what does not compile, and `seconds` and `compile_seconds`
+      to look at.
     """
     timed = race({_REFERENCE: reference, **jobs()}, rounds, tell)
     unit = timed[_REFERENCE].best
@@ -46,7 +52,7 @@ def bench_speed(tell: Tell = quiet, rounds: int = 5) -> list[Row]:
         {
             "name": name,
             "ratio": one.best / unit,
-            "compile_ratio": one.compile_seconds / unit,
+            "compile_ratio": one.compile_seconds / unit if one.compile_seconds > _COMPILES * unit else None,
             "seconds": one.best,
             "compile_seconds": one.compile_seconds,
         }
@@ -69,7 +75,7 @@ def reference(sweeps: int = 100, cells: int = 256) -> np.ndarray:
 
 
 def jobs() -> dict[str, Callable[[], Any]]:
-    """What users wait for, each small enough to take about as long as the reference loop."""
+    """What users wait for, each small enough to take a second at most."""
     scene, random = usual_scene(), np.random.default_rng(0)
     level = np.zeros((64, 32, 32), np.float32)
     rough = rough_surface(random, (512, 32, 32), 0.05, 3).astype(np.float32)
@@ -79,13 +85,12 @@ def jobs() -> dict[str, Callable[[], Any]]:
     _, states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
     actions = jnp.asarray(random.uniform(-1, 1, (64, 4)), jnp.float32)
     stepped = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
-    letter = np.array([[cell == "#" for cell in row] for row in (".####", "#....", ".###.", "....#", "####.")])
     return {
         "settle 512 maps": partial(settle_batch, usual_scene(tool=None), rough),
         "64 pushes": partial(step_batch, scene, level, strokes),
         "16 gradients of a push": partial(value_and_grad_batch, scene, _square, level[:16], strokes[:16]),
         "64 steps of an environment": partial(stepped, keys, states, actions, params),
-        "plan a letter": partial(plan, letter),
+        "plan a letter": partial(plan, LETTER),
     }
 
 
@@ -101,14 +106,23 @@ def with_history(rows: list[Row], origin: Mapping[str, Any], out: Path) -> list[
       ValueError: if the file cannot be written, or holds what is no run.
     """
     before = history(out)
-    figures = {row["name"]: {key: row[key] for key in ("ratio", "compile_ratio")} for row in rows}
+    figures = {row["name"]: {key: row[key] for key in _FIGURES if row[key] is not None} for row in rows}
     append_row(out / HISTORY, {**{key: origin.get(key) for key in ("commit", "date", "machine")}, "figures": figures})
     return slower([run["figures"] for run in before if run["machine"] == origin.get("machine")], figures)
 
 
 def history(out: Path) -> list[Row]:
-    """All runs that a folder knows, the oldest first."""
-    return known_rows(out / HISTORY, {"commit", "machine", "figures"})
+    """All runs that a folder knows, the oldest first.
+
+    Raises:
+      ValueError: if the file holds what is no run.
+    """
+    runs = known_rows(out / HISTORY, {"commit", "machine", "figures"})
+    for number, run in enumerate(runs, 1):
+        jobs = run["figures"].values() if isinstance(run["figures"], dict) else [None]
+        if not all(isinstance(job, dict) and all(isinstance(v, int | float) for v in job.values()) for job in jobs):
+            raise ValueError(f"out: run {number} of {out / HISTORY} has no figures; take it out, or give another folder")
+    return runs
 
 
 def slower(before: Sequence[Mapping[str, Any]], now: Mapping[str, Mapping[str, float]]) -> list[str]:
@@ -124,11 +138,12 @@ def slower(before: Sequence[Mapping[str, Any]], now: Mapping[str, Mapping[str, f
             known = [run[name][figure] for run in before if figure in run.get(name, {})][-_LAST:]
             if len(known) < _FEWEST:
                 continue
-            usual = float(np.median(known))
+            usual = max(float(np.median(known)), 1e-9)
             spread = max(float(np.std(known)), _LOOSE * usual)
             if value > max(_SLOWER * usual, usual + _SPREADS * spread):
-                times = f"{value / usual:.1f}" if usual else "many"
-                told.append(f"{name}: {figure} {value:.3g} is {times} times the {usual:.3g} of the last {len(known)} runs")
+                told.append(
+                    f"{name}: {figure} {value:.3g} is {value / usual:.1f} times the {usual:.3g} of the last {len(known)} runs"
+                )
     return told
 
 

@@ -1,5 +1,6 @@
 """Earth-moving tasks by several methods at equal numbers of pushes, with the measures of several fields."""
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -64,7 +65,7 @@ def bench_tasks(
     `figures`.
 
     The instances of a task are planned side by side by each method. A row for each, with its plan and the map that it
-    leaves, is then written to `out`/tasks.jsonl, and what is there already is not computed again.
+    leaves, is written to `out`/tasks.jsonl as it comes, and what is there already is not computed again.
 
     Every method may use as many strokes as the task allows, but at most `strokes`, and simulate `pushes` pushes; a gradient
     counts as what it costs. The policy's strokes are as deep as the goal, and are not tried. `seconds` is the time of all
@@ -93,10 +94,7 @@ def bench_tasks(
         new = [case for case in cases if _case(case) not in there]
         for some in (new[k : k + _AT_ONCE] for k in range(0, len(new), _AT_ONCE)):
             tell(f"{len(found)} of {total} done; {name} by {method}, {len(some)} at once")
-            for row in _several(some):
-                found.append(row)
-                if path:
-                    append_row(path, row)
+            found += _several(some, path)
     rows, maps = list[Row](), list[Row]()
     for name, method in product(names, methods):
         some = [row for row in found if (row["task"], row["method"]) == (name, method)]
@@ -147,12 +145,18 @@ class MethodPlan:
     best: AtBest | None = None
 
 
-def _several(cases: Sequence[Row]) -> list[Row]:
-    """The rows of some cases, planned side by side."""
-    began = time.perf_counter()
-    figures = side_by_side([partial(_one, case) for case in cases])
-    seconds = (time.perf_counter() - began) / len(cases)
-    return [{**case, **row, "seconds": seconds} for case, row in zip(cases, figures, strict=True)]
+def _several(cases: Sequence[Row], path: Path | None) -> list[Row]:
+    """The rows of some cases, planned side by side; each is written to the file at `path` as soon as it is there."""
+    began, writing = time.perf_counter(), threading.Lock()
+
+    def one(case: Row) -> Row:
+        row = case | _one(case) | {"seconds": (time.perf_counter() - began) / len(cases)}
+        if path:
+            with writing:
+                append_row(path, row)
+        return row
+
+    return side_by_side([partial(one, case) for case in cases])
 
 
 def _one(case: Row) -> Row:

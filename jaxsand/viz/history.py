@@ -1,5 +1,6 @@
 """How fast things were from commit to commit."""
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -7,6 +8,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MARKS = "osD^vPX"
+_MOST = 60  # runs that are drawn
 
 
 def history_figure(runs: Sequence[dict[str, Any]]) -> "Figure":
@@ -17,12 +19,12 @@ def history_figure(runs: Sequence[dict[str, Any]]) -> "Figure":
     """
     from matplotlib.figure import Figure
 
-    same = [run for run in runs if run["machine"] == runs[-1]["machine"]]
+    same = [run for run in runs if run["machine"] == runs[-1]["machine"]][-_MOST:]
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     for ax, name, title in zip(figure.subplots(1, 2), ("ratio", "compile_ratio"), ("run time", "compile time"), strict=True):
         for k, job in enumerate(same[-1]["figures"]):
-            some = [(at, run["figures"][job][name]) for at, run in enumerate(same) if job in run["figures"]]
-            ax.plot(*zip(*some, strict=True), _MARKS[k % len(_MARKS)] + "-", ms=5, label=job)
+            ratios = [run["figures"].get(job, {}).get(name, math.nan) for run in same]
+            ax.plot(ratios, _MARKS[k % len(_MARKS)] + "-", ms=5, label=job)
         ax.set(yscale="log", ylabel="over the reference loop's")
         ax.set_title(title, loc="left")
         ax.set_xticks(range(len(same)), [run["commit"] or "" for run in same], rotation=90, fontsize=7)

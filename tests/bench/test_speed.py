@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxsand.bench import speed
-from jaxsand.bench.speed import HISTORY, bench_speed, history, reference, slower, with_history
+from jaxsand.bench.speed import HISTORY, LETTER, bench_speed, history, reference, slower, with_history
+from jaxsand.planning.binary import plan
 from jaxsand.viz.history import history_figure
 
 STEADY = [{"push": {"ratio": 1.0 + 0.01 * k}} for k in range(10)]
@@ -26,7 +27,19 @@ def test_ratios_are_those_of_the_best_times(monkeypatch):
     rows = {row["name"]: row for row in bench_speed(rounds=2)}
     assert calls == {"fast": 3, "slow": 3}
     assert rows["fast"]["ratio"] < 1 < rows["slow"]["ratio"]
+    assert rows["fast"]["compile_ratio"] is None  # it does not compile
     assert rows["slow"]["seconds"] / rows["slow"]["ratio"] == pytest.approx(rows["fast"]["seconds"] / rows["fast"]["ratio"])
+
+
+def test_a_letter_is_planned():
+    assert plan(LETTER).optimal
+
+
+@pytest.mark.parametrize("figures", [5, {"push": 3}, {"push": {"ratio": None}}, {"push": {"ratio": "1"}}])
+def test_what_is_no_run_is_refused(figures, tmp_path):
+    (tmp_path / HISTORY).write_text(json.dumps({"machine": "one", "commit": None, "figures": figures}) + "\n")
+    with pytest.raises(ValueError, match=r"out: run 1 of .* has no figures; take it out"):
+        history(tmp_path)
 
 
 def test_the_reference_keeps_what_diffuses():
@@ -70,4 +83,5 @@ def test_runs_are_kept_and_compared_with_those_of_the_same_machine(tmp_path):
 def test_all_jobs_run():
     rows = bench_speed(rounds=1)
     assert {row["name"] for row in rows} == set(speed.jobs())
-    assert all(row["ratio"] > 0 and row["compile_ratio"] >= 0 for row in rows)
+    assert all(row["ratio"] > 0 for row in rows)
+    assert [row["name"] for row in rows if row["compile_ratio"] is None] == ["plan a letter"]

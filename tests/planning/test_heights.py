@@ -79,6 +79,20 @@ def test_goals_planned_side_by_side_have_the_plans_that_each_has_alone():
     assert js.plan_sand_batch(SCENE, LEVEL, []) == []
 
 
+@pytest.mark.parametrize(
+    ("goals", "message"),
+    [
+        (as_goal(SCENE, RAMP), "^goals: got Goal; give a list of goals"),
+        (None, "^goals: got NoneType; give a list"),
+        ([RAMP, LEVEL[:3]], r"^goal\[1\]: got shape \[3, 20\]"),
+        ([RAMP, 1e3 * LEVEL, "x"], r"^goal\[2\]: "),
+    ],
+)
+def test_goals_that_are_none_are_named(goals, message):
+    with pytest.raises(ValueError, match=message):
+        js.plan_sand_batch(SCENE, LEVEL, goals)
+
+
 @pytest.mark.slow
 def test_gradients_bring_a_ramp_closer(found):
     refined = js.optimise_strokes(SCENE, RAMP, guess=found.strokes, budget=2 * 5 * 20)
