@@ -141,9 +141,8 @@ def slower(before: Sequence[Mapping[str, Any]], now: Mapping[str, Mapping[str, f
             usual = max(float(np.median(known)), 1e-9)
             spread = max(float(np.std(known)), _LOOSE * usual)
             if value > max(_SLOWER * usual, usual + _SPREADS * spread):
-                told.append(
-                    f"{name}: {figure} {value:.3g} is {value / usual:.1f} times the {usual:.3g} of the last {len(known)} runs"
-                )
+                times = f"{value / usual:.1f} times the {usual:.3g} of the last {len(known)} runs"
+                told.append(f"{name}: {figure} {value:.3g} is {times}")
     return told
 
 

@@ -91,7 +91,7 @@ def _shape(commands: Any) -> None:
         help="search, optimise, policy: cells of a .npy goal where any height will do, as its NaN cells: a .png (dark is "
         "free; first row on top) or a .npy of booleans (first row as in the goal)",
     )
-    p.add_argument("--live", action="store_true", help="show the sand in the terminal as it is pushed")
+    p.add_argument("--live", action="store_true", help="show the sand in the terminal, path by path")
     p.add_argument("--html", action="store_true", help="also write shape.html, which a browser shows: sand to turn and play")
     p.add_argument("--out", type=path_name, metavar="DIR", help="folder to write to (shape-GOAL)")
     p.add_argument("--json", action="store_true", help="print one JSON object")

@@ -2,8 +2,10 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+_NAME = 40  # signs of a file's name that the name beside it has
 
 
 @contextmanager
@@ -13,14 +15,17 @@ def written(path: Path, field: str = "out") -> Iterator[Path]:
     Raises:
       ValueError: with the field's name, if it cannot be written; what was there stays.
     """
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    if "\0" in str(path):
+        raise ValueError(f"{field}: got a name that holds a NUL; choose another name")
+    beside = path.with_name(f".{path.name[:_NAME]}.{os.getpid()}")
     try:
         yield beside
         beside.replace(path)
     except OSError as error:
         raise ValueError(f"{field}: cannot write {path} ({reason(error)}); make room, or choose another folder") from None
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):
+            beside.unlink()
 
 
 def reason(error: BaseException) -> str:

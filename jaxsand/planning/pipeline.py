@@ -119,7 +119,7 @@ def shape(
       target: the goal and the strokes.
       before: the surface [H, W] (m), which is settled first; None stands for level sand at 0.
       tell: is called with a line of progress.
-      see: is called with every map [H, W] (m) on the way, as it comes.
+      see: is called with the start, and with every map [H, W] (m) on the way, a path at a time.
 
     Raises:
       OutcomeError: if the sand does not come to rest, or something is not finite.
@@ -129,6 +129,7 @@ def shape(
     start = at_rest(scene, before, tell)
     prepared = time.perf_counter()
     height, compile_seconds, run_seconds = start, 0.0, 0.0
+    see(start)
     frames, tools, bottoms = [start], [_nowhere()], [math.nan]
     ways = [_divided(path, float(scene.grid.spacing)) for path in target.paths]
     longest = _rounded(max(map(len, ways), default=2))

@@ -1,5 +1,6 @@
 """Height maps in a terminal: two cells of sand to a character, above each other, in colours."""
 
+import os
 import shutil
 import sys
 import time
@@ -19,7 +20,8 @@ def half_blocks(height: np.ndarray, span: float, columns: int, lines: int) -> li
     """A map [H, W] (m) as lines of text, its last row on top, at most so many columns and lines.
 
     Every character is the upper half of a block, in the colour of one cell on that of the cell below it. Heights from -span
-    to span (m) take the colours that heights have in all pictures. Of a map that does not fit, every n-th cell is shown.
+    to span (m) take the colours that heights have in all pictures. Where a map does not fit, n x n cells become one, as high
+    as the one of them that is farthest from height 0.
 
     Example:
       >>> import numpy as np
@@ -30,14 +32,23 @@ def half_blocks(height: np.ndarray, span: float, columns: int, lines: int) -> li
 
     rows, across = height.shape
     every = max(1, -(-across // columns), -(-rows // (2 * lines)))
-    shown = np.asarray(height, float)[::every, ::every][::-1]
+    shown = _largest(np.asarray(height, float), every)[::-1]
     if len(shown) % 2:
         shown = np.concatenate([shown, np.full_like(shown[:1], np.nan)])
-    part = np.clip(shown / (2 * span) + 0.5, 0, 1)
+    part = np.clip(shown / (2 * max(span, 1e-9)) + 0.5, 0, 1)
     colours = np.where(np.isnan(part)[..., None], 0, colormaps[HEIGHTS](np.nan_to_num(part), bytes=True)[..., :3])
     upper, lower = (_joined(c) for c in (colours[::2], colours[1::2]))
     pairs = [zip(a, b, strict=True) for a, b in zip(upper, lower, strict=True)]
     return ["".join(f"\033[38;2;{a};48;2;{b}m▀" for a, b in line) + "\033[0m" for line in pairs]
+
+
+def _largest(height: np.ndarray, every: int) -> np.ndarray:
+    """Of each block of `every` x `every` cells the height that is farthest from 0."""
+    wide = np.pad(height, [(0, -n % every) for n in height.shape], constant_values=np.nan)
+    rows, columns = (n // every for n in wide.shape)
+    blocks = wide.reshape(rows, every, columns, every).swapaxes(1, 2).reshape(rows, columns, every**2)
+    far = np.argmax(np.nan_to_num(np.abs(blocks), nan=-1), axis=-1)
+    return np.take_along_axis(blocks, far[..., None], axis=-1)[..., 0]
 
 
 def _joined(colours: np.ndarray) -> list[list[str]]:
@@ -69,5 +80,6 @@ class Live:
 
 
 def live(span: float) -> Callable[[np.ndarray], None]:
-    """What draws maps on the terminal as they come; what draws nothing where standard error is no terminal."""
-    return Live(span, sys.stderr) if sys.stderr.isatty() else lambda _: None
+    """What draws maps on the terminal as they come; what draws nothing where standard error is none, or shows no colours."""
+    colours = os.environ.get("TERM") != "dumb" and not os.environ.get("NO_COLOR")
+    return Live(span, sys.stderr) if colours and sys.stderr.isatty() else lambda _: None

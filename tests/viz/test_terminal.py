@@ -38,6 +38,15 @@ def test_a_map_is_thinned_out_until_it_fits_and_what_is_not_known_is_black():
     assert not odd.any()
 
 
+def test_a_narrow_trench_stays_where_a_map_is_thinned_out():
+    height = np.zeros((100, 100))
+    height[:, 51] = -0.01
+    seen = colours(half_blocks(height, 0.01, 80, 24))
+    assert seen.shape[:2] == (34, 34)  # 3 x 3 cells are one
+    assert (seen[:, 17] != seen[:, 0]).any(-1).all()
+    assert (seen[:, [16, 18]] == seen[:, [0]]).all()
+
+
 def test_each_map_is_drawn_over_the_one_before(monkeypatch):
     monkeypatch.setattr(terminal.time, "sleep", lambda _: None)
     monkeypatch.setattr(terminal.shutil, "get_terminal_size", lambda: terminal.shutil.os.terminal_size((80, 24)))
@@ -55,6 +64,8 @@ def test_nothing_is_drawn_where_there_is_no_terminal(monkeypatch, terminal_there
         def isatty(self):
             return terminal_there
 
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setattr(terminal.sys, "stderr", out := Stream())
     live(0.01)(np.zeros((4, 4)))
     assert bool(out.getvalue()) == terminal_there

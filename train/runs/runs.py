@@ -111,9 +111,10 @@ def run(
         raise ValueError("minutes: got none, and no steps; give one of them")
     tell = tell or progress()
     began = time.monotonic()
-    there = _check_there(out, resume)
+    _check_there(out, resume)  # which makes the folder
     with ExitStack() as held:
         held.enter_context(_alone(out))
+        there = _check_there(out, resume)  # another run may have begun, and ended, until now
         state, at = _begin(learner, out, seed, there)
         rows, asked = held.enter_context(_rows(out, at.rows)), held.enter_context(_asked_to_stop())
         started = began - at.seconds
