@@ -38,6 +38,7 @@ _AHEAD = 0.29  # cells: how far ahead of the blade it begins between open ends
 _GAP, _GAP_CELLS = 0.096, 0.35  # where the berms' crests lie outside of the blade's ends
 _NEAR = 0.48  # how far the berms reach from there
 _INTO, _DEEP = 0.78, 0.3  # 1 - exp(-_INTO - _DEEP (r / w)^3) of the berms has slid back into the trench behind the blade
+_DEEPEST = 3.5  # r / w: beyond it, where a millionth stays outside, that share does not fall any more
 _INNER = 0.93  # how far it is strewn
 _BACK = 0.67  # of the sand under the blade when it is lowered: what leaves behind it and to its sides
 _FAR = 50.0  # times the blade's thickness: no sand comes from farther back sooner than from there
@@ -170,11 +171,12 @@ def _sweep_out(  # noqa: PLR0915
         rim = RimAhead.of(scene, site, ground, sand, seen)
 
     # The berms, left and right; where they find room.
-    into = 1 - jnp.exp(-_INTO - _DEEP * (reach / (2 * side)) ** 3)
-    near, inner = jnp.maximum(_NEAR * reach * jnp.sqrt(1 - into), dx / 2), _INNER * reach + dx / 2
+    outer = jnp.exp(-_INTO - _DEEP * jnp.minimum(reach / (2 * side), _DEEPEST) ** 3)
+    into = 1 - outer
+    near, inner = jnp.maximum(_NEAR * reach * jnp.sqrt(outer), dx / 2), _INNER * reach + dx / 2
     part = jnp.minimum(side / inner, 1)  # how much of that there is from either end to the middle
     left = jnp.clip(n / dx + 0.5, 0, 1)
-    outside = wedge(off - _GAP * reach - _GAP_CELLS * dx, near, dx) * (1 - into) * seen
+    outside = wedge(off - _GAP * reach - _GAP_CELLS * dx, near, dx) * outer * seen
     inside = wedge(-off, inner, dx) * (into / (part * (2 - part))) * seen
     if isinstance(scene.walls, Walls):
         profiles = (left * outside, (1 - left) * outside, left * inside, (1 - left) * inside)
@@ -183,11 +185,11 @@ def _sweep_out(  # noqa: PLR0915
         points = jnp.asarray(POINTS, h.dtype)
         farther, nearer = side + _GAP * reach + _GAP_CELLS * dx + near * points, side - jnp.minimum(inner, side) * points
         rooms = jnp.stack([on_line(scene, pose, place, x, dx, WEIGHTS) for x in (farther, -farther, nearer, -nearer)])
-        rooms = rooms * jnp.stack([1 - into, 1 - into, into, into])[:, None]
+        rooms = rooms * jnp.stack([outer, outer, into, into])[:, None]
     beyond = jnp.zeros_like(rooms[:2])
     if rim is not None:
-        beyond = rim.berms(pose, place, side, reach, mu * reach, dx) * (1 - into)
-    open_ = jnp.minimum((rooms[:2] + beyond) / (ROOM * (1 - into)), 1)
+        beyond = rim.berms(pose, place, side, reach, mu * reach, dx) * outer
+    open_ = jnp.minimum((rooms[:2] + beyond) / (ROOM * outer), 1)
     flanks = jnp.sum(open_, axis=0) / 2
     there_end = hat(jnp.clip((end - origin) / thick, 0, count - 1)[None, None], slices)[:, 0]
     if rim is not None:

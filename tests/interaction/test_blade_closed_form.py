@@ -285,3 +285,13 @@ def test_half_a_blade_beside_a_closed_edge_is_half_of_one_twice_as_wide():
     whole = js.act(scene(js.Blade(0.08, 0.015, 0.0075)), level(), stroke, push=FAST).height
     half = js.act(small, level()[:16], stroke, push=FAST).height
     assert np.abs(half - whole[:16]).sum() < 1e-4 * np.abs(whole[:16]).sum()
+
+
+@pytest.mark.parametrize(("depth", "degrees"), [(10.0, 29), (0.0075, 0.01)])
+def test_a_blade_far_too_deep_for_its_width_leaves_a_clear_outcome(depth, degrees):
+    """Nearly all of its berms slides back into the trench: the share that does not was once 0, and what stood there 0 / 0."""
+    sand = js.make_scene((12, 12), 0.01, math.radians(degrees), tool=js.Blade(0.02, 0.015, depth))
+    pushed = js.act(sand, np.zeros((12, 12)), np.array([0.03, 0.06, 0.09, 0.06]), push=js.SwathPush())
+    js.check(pushed)
+    assert volume_error(np.zeros((12, 12)), pushed.height) < 1e-12
+    assert np.asarray(pushed.height).min() < -0.5 * depth
