@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsand as js
-from jaxsand.bench.gradient_checks import GradientCase, against_differences
+from jaxsand.bench.gradient_checks import against_differences
 from jaxsand.bench.gradients import CASES
 
 SHAPE = (12, 12)
@@ -128,7 +128,7 @@ def check_finite(kind, count, seed=0, batch=500):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_gradients_are_finite_in_extreme_cases(kind):
-    check_finite(kind, 2000, seed=1)
+    check_finite(kind, 1000, seed=1)
 
 
 def check_smooth_points(case, least, most):
@@ -140,11 +140,6 @@ def check_smooth_points(case, least, most):
         error, smooth = against_differences(case, 100, seed=7 * tried, cells=24)
         assert error[smooth].max() <= 1e-5
         found, tried = found + int(smooth.all(0).sum()), tried + 100
-
-
-@pytest.mark.slow
-def test_gradients_are_right_at_fifty_smooth_points():
-    check_smooth_points(GradientCase(True), 50, 300)
 
 
 @pytest.mark.slow
