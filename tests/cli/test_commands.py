@@ -333,11 +333,11 @@ def test_pictures_do_not_depend_on_the_users_matplotlib(tmp_path):
 def test_what_a_plan_leaves_out_is_told():
     """Nothing is proven shortest that leaves out a part of the goal; see `test_pipeline`."""
     from jaxsand.cli.shape import _left_out, _summary
-    from jaxsand.planning import pipeline
+    from jaxsand.planning import targets
 
     goal = np.zeros((48, 48))
     goal[6:12, 6:30] = goal[27:33, 6:30] = -0.0075
-    target = pipeline.height_target(goal, "heights", "straddle", pipeline.Layout(depth=0.0075))
+    target = targets.height_target(goal, "heights", "straddle", targets.Layout(depth=0.0075))
     told = _left_out(target, SimpleNamespace(resolution=None))
     assert told.startswith("144 of 288 dug cells are left out")
     assert "a smaller --resolution, or use --method search" in told
