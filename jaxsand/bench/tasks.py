@@ -94,7 +94,7 @@ def bench_tasks(
         new = [case for case in cases if _case(case) not in there]
         for some in (new[k : k + _AT_ONCE] for k in range(0, len(new), _AT_ONCE)):
             tell(f"{len(found)} of {total} done; {name} by {method}, {len(some)} at once")
-            found += _several(some, path)
+            found += _several(some, path, tell)
     rows, maps = list[Row](), list[Row]()
     for name, method in product(names, methods):
         some = [row for row in found if (row["task"], row["method"]) == (name, method)]
@@ -145,14 +145,15 @@ class MethodPlan:
     best: AtBest | None = None
 
 
-def _several(cases: Sequence[Row], path: Path | None) -> list[Row]:
-    """The rows of some cases, planned side by side; each is written to the file at `path` as soon as it is there."""
+def _several(cases: Sequence[Row], path: Path | None, tell: Tell) -> list[Row]:
+    """The rows of some cases, planned side by side; each is told of, and written to the file at `path`, once it is there."""
     began, writing = time.perf_counter(), threading.Lock()
 
     def one(case: Row) -> Row:
         row = case | _one(case) | {"seconds": (time.perf_counter() - began) / len(cases)}
-        if path:
-            with writing:
+        with writing:
+            tell(f"{row['task']} {row['key']} by {row['method']}: {row['before_mm']:.2g} to {row['mean_mm']:.2g} mm")
+            if path:
                 append_row(path, row)
         return row
 

@@ -61,7 +61,9 @@ def test_what_is_there_already_is_not_computed_again(monkeypatch, tmp_path):
     given = {"names": ("ring", "spread"), "methods": ("random", "coverage"), "instances": 2, "pushes": 3, "out": tmp_path}
     told = []
     whole = bench_tasks(told.append, **given)
-    assert told[:2] == ["0 of 8 done; ring by random, 2 at once", "2 of 8 done; ring by coverage, 2 at once"]
+    assert told[0] == "0 of 8 done; ring by random, 2 at once"
+    assert {line.partition(":")[0] for line in told[1:3]} == {"ring 0 by random", "ring 1 by random"}
+    assert told[3] == "2 of 8 done; ring by coverage, 2 at once"
     assert len(made) == 8
     assert made[0] != made[1]
     lines = (tmp_path / "tasks.jsonl").read_text().splitlines()
