@@ -15,9 +15,10 @@ def append_row(path: Path, row: Row) -> None:
       ValueError: if it cannot be written; the rows that are there stay.
     """
     try:
-        cut = path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n")
-        data = ("\n" * cut + json.dumps(row) + "\n").encode()
-        with path.open("ab", buffering=0) as file:  # in one piece, beside those of another bench
+        with path.open("a+b", buffering=0) as file:  # in one piece, beside those of another bench
+            file.seek(max(file.seek(0, os.SEEK_END) - 1, 0))
+            cut = file.read(1) not in (b"", b"\n")
+            data = ("\n" * cut + json.dumps(row) + "\n").encode()
             if file.write(data) != len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError as error:

@@ -145,7 +145,7 @@ def test_names_that_lead_elsewhere_lead_nowhere(here):
     os.chdir(inner)
     arrays = {
         "../../x": np.zeros(2),
-        "/tmp/jaxsand-x": np.zeros(2),
+        str(here / "y"): np.zeros(2),
         "elevation": np.zeros((2, 2)),
         "resolution": np.array(0.1),
     }
@@ -159,7 +159,6 @@ def test_names_that_lead_elsewhere_lead_nowhere(here):
     with pytest.raises(ValueError, match="policy: "):
         load_policy(Path("x.npz"))
     assert sorted(here.rglob("*")) == before
-    assert not Path("/tmp/jaxsand-x.npy").exists()
 
 
 @pytest.mark.parametrize(
