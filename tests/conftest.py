@@ -36,6 +36,7 @@ WAYS = {"compiled": {}, "slow": OLDER, "long": OLDER}
 older emitters alone they are compiled twice as fast, and run as fast."""
 
 _options: dict[str, Any] = {}
+KEPT_BY = "jax_pgle_profiling_runs"  # says nothing to a CPU, but is among what JAX keeps its programs by
 
 
 def _hurry() -> None:
@@ -68,19 +69,18 @@ def _hurried(item: pytest.Item) -> bool:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """In each file, what is compiled in one way runs together."""
     items[:] = [item for item in items if not (_hurried(item) and item.get_closest_marker("slow"))]
-    files, ways = list(dict.fromkeys(item.path for item in items)), [HURRY, *WAYS.values()]
-    items.sort(key=lambda item: (files.index(item.path), ways.index(_way(item))))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Compiled programs are kept for later tests, but not from one way of compiling to the other, nor without end."""
-    way, maps = _way(item), Path("/proc/self/maps")
-    if way != _options or (maps.exists() and maps.read_bytes().count(b"\n") > ROOM):
+    """Compiled programs are kept for later tests, apart for each way of compiling, and not without end."""
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > ROOM:
         jax.clear_caches()
+    way = _way(item)
     _options.clear()
     _options.update(way)
+    jax.config.update(KEPT_BY, [HURRY, OLDER, {}].index(way))
 
 
 def turned(stroke: Sequence[float], side: float) -> list[tuple[Callable, tuple[float, ...]]]:
