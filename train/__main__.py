@@ -66,6 +66,7 @@ def _evaluation(commands: "argparse._SubParsersAction[Parser]") -> None:
     p.add_argument(
         "--out", type=path_name, metavar="DIR", help="folder for the report, and for a picture of goals and results on sand"
     )
+    p.add_argument("--html", action="store_true", help="also write evaluate.html: goals and sand, in a browser")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(command=run_evaluation)
 

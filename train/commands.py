@@ -65,6 +65,8 @@ def run_evaluation(options: argparse.Namespace) -> None:
     """Reports how many glyphs, or letter maps, a run's best state gets right."""
     tell = progress()
     tell("getting ready")
+    if options.html and not options.out:
+        raise ValueError("html: goes to a folder; add --out DIR")
     out = folder(options.out) if options.out else None
     if options.run == "pretrained":
         from jaxsand.planning.learned.policy import load_policy
@@ -142,7 +144,7 @@ def _on_sand(policy: "Proposes", options: argparse.Namespace, tell: Tell, out: P
     """Evaluates a policy on glyphs, and writes report and picture if asked."""
     from jaxsand.planning.learned.stages import Stages
     from train.evaluation.glyphs import SETS, read_glyphs
-    from train.evaluation.scores import evaluate, picture
+    from train.evaluation.scores import evaluate, page, picture
 
     if options.goals is not None and options.goals not in SETS:
         raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(SETS)}")
@@ -155,12 +157,14 @@ def _on_sand(policy: "Proposes", options: argparse.Namespace, tell: Tell, out: P
         write_json(out / _REPORT, report)
         with written(out / "evaluate.png") as path:
             save_figure(lambda: picture(glyphs, report), path)
+        if options.html:
+            page(glyphs, report).to_html(out / "evaluate.html")
     return report
 
 
 def _on_maps(learner: "Dqn", state: "Walking", options: argparse.Namespace, tell: Tell, out: Path | None) -> dict[str, Any]:
     """Evaluates a DQN on letter maps, and writes the report if asked."""
-    for option in ("glyphs", "goals", "refine"):
+    for option in ("glyphs", "goals", "refine", "html"):
         if getattr(options, option):
             raise ValueError(f"{option}: has an effect on strokes only, and dqn walks over maps; leave it out")
     from train.dqn.walks import evaluate

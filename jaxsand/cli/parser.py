@@ -137,6 +137,9 @@ def _trench(commands: Any) -> None:
     p.add_argument("--measured", type=path_name, metavar="CSV", help=f"scans: {columns}")
     p.add_argument("--no-data", type=number, metavar="V", help="heights of this value in the CSV were not seen: -9999, ...")
     p.add_argument("--out", type=path_name, metavar="DIR", help="folder for the profiles, two figures and the report")
+    p.add_argument(
+        "--html", action="store_true", help="also write trench.html into it: the sand of all trenches, in a browser"
+    )
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_trench)
 

@@ -3,12 +3,16 @@
 import argparse
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxsand.bench.tables import as_table
 from jaxsand.cli.files import as_json, folder, progress
 from jaxsand.cli.printing import show
 from jaxsand.goals.writing import written
+
+if TYPE_CHECKING:
+    from jaxsand.terramechanics.trench_experiment import Rut
+    from jaxsand.viz.viewer import Page
 
 _FILES = ("profiles.csv", "trench.png", "trench-errors.png", "trench.json")
 
@@ -19,7 +23,9 @@ def run_trench(options: argparse.Namespace) -> None:
     if not 0.25 <= options.spacing_mm <= 20:
         raise ValueError(f"spacing-mm: got {options.spacing_mm:g}; give millimetres from 0.25 to 20")
     out = folder(options.out) if options.out else None
-    files = [out / name for name in _FILES] if out else []
+    if options.html and not out:
+        raise ValueError("html: goes to a folder; add --out DIR")
+    files = [out / name for name in _FILES + ("trench.html",) * options.html] if out else []
     for file in files:
         if file.is_dir():
             raise ValueError(f"out: cannot write {file}, which is a folder; choose another folder")
@@ -31,7 +37,7 @@ def run_trench(options: argparse.Namespace) -> None:
     scans = read_scans(options.measured, options.no_data) if options.measured else {}
     trench_experiment.check_scans(scans)
     rules = [options.rule] if options.rule else list(trench_experiment.RULES)
-    report, profiles = trench_experiment.experiment(options.spacing_mm * 1e-3, rules, scans, tell)
+    report, profiles, ruts = trench_experiment.experiment(options.spacing_mm * 1e-3, rules, scans, tell)
     if out:
         from jaxsand.viz.render import save_figure
         from jaxsand.viz.trenches import errors_figure, profiles_figure
@@ -44,8 +50,18 @@ def run_trench(options: argparse.Namespace) -> None:
             save_figure(lambda: profiles_figure(profiles), paths[1])
             save_figure(lambda: errors_figure(profiles), paths[2])
             paths[3].write_text(as_json(report, indent=1) + "\n", encoding="utf-8")
+            if options.html:
+                paths[4].write_text(_page(ruts[rules[0]]).html(), encoding="utf-8")
     tell("")
     show(options, report, _table)
+
+
+def _page(ruts: dict[tuple[float, float], "Rut"]) -> "Page":
+    """What shows the sand of all trenches in a browser."""
+    from jaxsand.viz.viewer import Panel, view
+
+    panels = [Panel(rut.height, rut.spacing, f"{beta:g}°, {sinkage:g} mm") for (beta, sinkage), rut in ruts.items()]
+    return view(*panels, title="Trenches of a wheel, by slip angle and sinkage")
 
 
 def _write_profiles(profiles: dict[str, dict[tuple[float, float], Any]], path: Path) -> None:

@@ -46,6 +46,7 @@ PAPER = {
 }
 _WIDE, _BEFORE, _LENGTH, _AFTER = 0.32, 0.1, 1.0, 0.14  # m: across the way; along it
 _AROUND = 0.28  # m of the way that are computed at a time
+_SHOWN = 2e-3  # m between the cells of a map that is kept
 _APART = 0.05  # m between the sections that tell how steady the trench is
 
 
@@ -57,11 +58,15 @@ class Rut:
       profile: the section half-way.
       unsteady: the mean distance (m) between that section and the one 5 cm before it.
       seconds: how long the simulation took.
+      height: the sand that it left (m), row 0 at y = 0: at every cell, or at one every 2 mm where those are finer.
+      spacing: of the cells of `height` (m).
     """
 
     profile: Profile
     unsteady: float
     seconds: float
+    height: np.ndarray
+    spacing: float
 
 
 def simulate(trench: Trench, spacing: float, push: PushRule) -> Rut:
@@ -90,7 +95,9 @@ def simulate(trench: Trench, spacing: float, push: PushRule) -> Rut:
         return Profile(across, np.asarray(shaped.height, float)[::-1, int(along / spacing)])
 
     half, earlier = section(_BEFORE + _LENGTH / 2), section(_BEFORE + _LENGTH / 2 - _APART)
-    return Rut(half, float(np.abs(half.z - earlier.z).mean()), seconds)
+    every = max(1, round(_SHOWN / spacing))
+    kept = np.asarray(shaped.height)[::every, ::every]
+    return Rut(half, float(np.abs(half.z - earlier.z).mean()), seconds, kept, every * spacing)
 
 
 def simulate_all(trenches: Iterable[Trench], spacing: float, push: PushRule, tell: Tell = quiet) -> dict[Trench, Rut]:
@@ -166,7 +173,7 @@ def experiment(
     rules: Iterable[str] = tuple(RULES),
     scans: dict[Trench, list[Scan]] | None = None,
     tell: Tell = quiet,
-) -> tuple[Figures, dict[str, dict[Trench, Profile]]]:
+) -> tuple[Figures, dict[str, dict[Trench, Profile]], dict[str, dict[Trench, Rut]]]:
     """Simulates all fifteen trenches with each rule, and compares them.
 
     Args:
@@ -178,14 +185,15 @@ def experiment(
     Returns:
       The table: `rows`, and their means in `summary`, `by_beta_deg` and `by_sinkage_mm`; and the profiles by their source,
         which is a rule or a reference. Scans are aligned with the sections of each rule: `measured` has those aligned with
-        the first rule's, `measured-split` those aligned with a second one's.
+        the first rule's, `measured-split` those aligned with a second one's. Last, the ruts of each rule.
     """
     known = references(TRENCHES)
     profiles: dict[str, dict[Trench, Profile]] = dict(known)
+    made: dict[str, dict[Trench, Rut]] = {}
     rows: list[Figures] = []
     scans = scans or {}
     for rule in rules:
-        ruts = simulate_all(dict.fromkeys([*TRENCHES, *scans]), spacing, RULES[rule], tell)
+        ruts = made[rule] = simulate_all(dict.fromkeys([*TRENCHES, *scans]), spacing, RULES[rule], tell)
         profiles[rule] = {trench: rut.profile for trench, rut in ruts.items()}
         for name, of in known.items():
             for trench, reference in of.items():
@@ -211,7 +219,7 @@ def experiment(
         "paper": PAPER,
         "not_scanned": [list(trench) for trench in TRENCHES if trench not in scans] if scans else [],
     }
-    return report, profiles
+    return report, profiles, made
 
 
 def _named(trench: Trench) -> dict[str, float]:

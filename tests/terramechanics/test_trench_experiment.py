@@ -68,7 +68,7 @@ def test_split_converges_and_own_comes_as_close_as_its_limit():
     Sand at rest around a wheel flows around its ends, which sections that exchange nothing do not know: deep oblique
     trenches come out 2 to 3 mm shallower. Where the wheel runs along its plane the two agree.
     """
-    report, _ = rut.experiment(2e-3)
+    report, *_ = rut.experiment(2e-3)
     split, own = report["summary"]["split"]["exact"], report["summary"]["own"]
     assert split["mean_abs_mm"] < 0.03
     assert split["depth_error_mm"] < 0.06
@@ -122,7 +122,19 @@ def test_error_against_spacing_and_the_papers_case_are_measured():
 @pytest.mark.wide
 def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    arguments = ["trench", "--spacing-mm", "8", "--rule", "split", "--measured", str(FIXTURE), "--out", "out", "--json"]
+    arguments = [
+        "trench",
+        "--spacing-mm",
+        "8",
+        "--rule",
+        "split",
+        "--measured",
+        str(FIXTURE),
+        "--out",
+        "out",
+        "--html",
+        "--json",
+    ]
     assert main(arguments) == 0
     report = json.loads(capsys.readouterr().out)
     assert len(report["rows"]) == 44
@@ -130,9 +142,11 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "profiles.csv",
         "trench-errors.png",
+        "trench.html",
         "trench.json",
         "trench.png",
     ]
+    assert "22.5\\u00b0, 15 mm" in (tmp_path / "out" / "trench.html").read_text(encoding="utf-8")
     with (tmp_path / "out" / "profiles.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["source"] for row in rows} == {"split", "closed-form", "exact", "measured"}
@@ -149,6 +163,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
         (["--measured", "heights.npy"], "measured: heights.npy is no text in UTF-8; give a CSV file of scans"),
         (["--measured", "short.csv"], "measured: short.csv: no columns sinkage_mm in line 1, the header; give a CSV"),
         (["--measured", "deep.csv"], "measured: got a trench of beta 45 degrees, sinkage 80 mm"),
+        (["--html"], "html: goes to a folder; add --out DIR"),
         (["--out", ""], "out: got an empty name"),
         (["--out", "taken"], "out: cannot write taken/trench.png, which is a folder"),
         (["--out", "deep.csv"], "out: cannot write to deep.csv"),

@@ -186,6 +186,7 @@ def test_mistakes_end_with_one_line_and_exit_code_2(tmp_path, quick, capsys, mon
         (["hindsight", "--resume", "--steps", "1", "--out", tmp_path / "none"], "error: out: there is no run in "),
         (["evaluate", tmp_path / "none"], "error: run: there is none in "),
         (["ship", tmp_path / "none"], "error: run: there is none in "),
+        (["evaluate", tmp_path / "run", "--html"], "error: html: goes to a folder; add --out DIR"),
         (["evaluate", tmp_path / "run", "--goals", "runes"], "error: goals: got 'runes'; give one of letters, "),
         (["evaluate", tmp_path / "run", "--glyphs", tmp_path / "none"], "error: "),
     ):

@@ -11,7 +11,7 @@ from jaxsand.bench.stroke_goals import letters
 from jaxsand.planning.learned.stages import Stages
 from train.curves import curve, curves_figure, main
 from train.evaluation.glyphs import SETS, read_glyphs
-from train.evaluation.scores import evaluate, judged, picture
+from train.evaluation.scores import evaluate, judged, page, picture
 
 GLYPHS = letters("LT")
 
@@ -63,6 +63,18 @@ def test_one_stroke_again_and_again_is_one_right_stroke():
 def test_no_push_changes_nothing():
     row = judged(GLYPHS[0], np.zeros((0, 4)))
     assert (row["iou"], row["l2_reduction"], row["right"], row["pushes"]) == (0, 0, False, [])
+
+
+def test_a_page_shows_each_glyph_after_each_push_beside_its_goal():
+    glyph = GLYPHS[0]
+    row = judged(glyph, glyph.strokes)
+    shown = page([glyph], {"glyphs": {glyph.name: row}, "right": 1, "total": 1})
+    (panel,) = shown.panels
+    assert (shown.title, panel.title, panel.spacing) == ("1 of 1 right", "L*: IoU 1.000", 0.01)
+    assert panel.heights.shape == (len(glyph.strokes) + 1, *glyph.goal.shape)
+    np.testing.assert_array_equal(panel.heights[0], glyph.start)
+    np.testing.assert_allclose(panel.heights[-1], panel.goal, atol=1e-6)
+    np.testing.assert_allclose(np.reshape(panel.paths, (-1, 4)), glyph.strokes, atol=1e-6)
 
 
 def test_a_glyph_file_is_read_as_letters_are(tmp_path):

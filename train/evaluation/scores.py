@@ -1,6 +1,7 @@
 """How many glyphs a policy gets right: alone, with look-ahead by the simulator, and after refinement by gradients."""
 
 import time
+from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,10 @@ from jaxsand.goals.success import right, strict, strokes_right
 from jaxsand.planning.learned.beam_search import Proposes
 from jaxsand.planning.learned.stages import Stages, plan_by_policy
 from jaxsand.planning.side_by_side import side_by_side
+from jaxsand.planning.stroke_loss import pushed
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.viz.strokes import found_figure
+from jaxsand.viz.viewer import Page, Panel, view
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,11 +69,36 @@ def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:
 
 def picture(glyphs: list[StrokeGoal], report: dict[str, Any]) -> "Figure":
     """Goals, and below each what the pushes of a report left, with its IoU; a star where it is right."""
-    shown = []
+    return found_figure(
+        [
+            (name, row["iou"], glyph.goal - glyph.start, maps[-1] - glyph.start)
+            for name, row, glyph, maps in _pushed(glyphs, report)
+        ]
+    )
+
+
+def page(glyphs: list[StrokeGoal], report: dict[str, Any]) -> Page:
+    """Sand to turn and play in a browser: every glyph after each of its pushes, beside its goal."""
+    return view(
+        *[
+            Panel(maps, float(glyph.scene.grid.spacing), f"{name}: IoU {row['iou']:.3f}", glyph.goal, _ways(row))
+            for name, row, glyph, maps in _pushed(glyphs, report)
+        ],
+        title=f"{report['right']} of {report['total']} right",
+    )
+
+
+def _ways(row: dict[str, Any]) -> tuple[np.ndarray, ...]:
+    return tuple(np.array(row["pushes"], float).reshape(-1, 2, 2))
+
+
+def _pushed(
+    glyphs: list[StrokeGoal], report: dict[str, Any]
+) -> Iterator[tuple[str, dict[str, Any], StrokeGoal, np.ndarray]]:
+    """Each glyph's name, with a star where it is right, its row of the report, and its maps [M + 1, H, W] (m)."""
     for glyph in glyphs:
         row = report["glyphs"][glyph.name]
-        pushes = np.array(row["pushes"], float).reshape(-1, 4)
-        after = glyph.sand.maps(pushes[None])[0]
-        name = f"{glyph.name}*" if row["right"] else glyph.name
-        shown.append((name, row["iou"], glyph.goal - glyph.start, after - glyph.start))
-    return found_figure(shown)
+        maps = [np.asarray(glyph.start, np.float32)]
+        for way in _ways(row):
+            maps.append(pushed(glyph.scene, maps[-1][None], way.reshape(1, 4))[0])
+        yield f"{glyph.name}*" if row["right"] else glyph.name, row, glyph, np.stack(maps)
