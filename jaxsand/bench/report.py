@@ -52,7 +52,6 @@ from jaxsand.scene.scene import Scene
 _CELLS = 32
 _SPACING = 0.01
 _ANGLE = math.radians(29)
-_ROUNDS = 5
 _NUMPY = "numpy, one map at a time"
 _C = "C loop, one core"
 

@@ -64,12 +64,3 @@ def check_rates(report):
         assert 0 < row["error"] < 0.2
     text = benchmark.table(report)
     assert all(row["name"] in text for row in report["settle"])
-
-
-@pytest.mark.slow
-def test_the_benchmark_of_pushes_reports_every_way(monkeypatch):
-    monkeypatch.setattr(benchmark, "_ROUNDS", 1)
-    report = benchmark.bench("push", batch=16, grids=0)
-    assert {row["name"] for row in report["push"]} >= {"step_batch", "vmap(step)"}
-    assert all(0 < row["error"] < 0.5 for row in report["push"])
-    assert all(row["name"] in benchmark.table(report) for row in report["push"])
