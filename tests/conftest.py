@@ -31,9 +31,11 @@ HURRY = {
     "xla_llvm_disable_expensive_passes": True,
 }
 OLDER = {"xla_cpu_use_fusion_emitters": False}
-WAYS = {"compiled": {}, "slow": OLDER, "long": OLDER}
-"""XLA's options by a test's marker. In a hurry programs are compiled six times as fast, and run four times as slowly; by the
-older emitters alone they are compiled twice as fast, and run as fast."""
+WAYS = {"compiled": {}, "long": OLDER}
+COMPUTING = ("bench", "planning", "terramechanics", "train")
+"""XLA's options by a test's marker; slow tests of these rooms are long, too. In a hurry programs are compiled six times as
+fast, and run four times as slowly; by the older emitters alone they are compiled twice as fast, and run as fast, but for a few
+large derivatives, which those take for ever to compile."""
 
 _options: dict[str, Any] = {}
 KEPT_BY = "jax_pgle_profiling_runs"  # says nothing to a CPU, but is among what JAX keeps its programs by
@@ -60,7 +62,8 @@ _hurry()
 
 
 def _way(item: pytest.Item) -> dict[str, Any]:
-    return next((options for name, options in WAYS.items() if item.get_closest_marker(name)), HURRY)
+    long = item.get_closest_marker("slow") and item.path.parent.name in COMPUTING
+    return next((options for name, options in WAYS.items() if item.get_closest_marker(name)), OLDER if long else HURRY)
 
 
 def _hurried(item: pytest.Item) -> bool:

@@ -1,6 +1,5 @@
 """Files are whole or not there: what a full disk, a folder that cannot be written to, or a kill leaves."""
 
-import ctypes
 import errno
 import json
 import os
@@ -275,10 +274,13 @@ def test_a_command_that_is_killed_leaves_whole_files(tmp_path, words, files, lon
                     image.load()
 
 
-def as_others():
-    """Takes from root, before a program starts, the right to write where nobody may."""
-    if os.geteuid() == 0:
-        ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)  # PR_CAPBSET_DROP, CAP_DAC_OVERRIDE
+AS_OTHERS = """
+import ctypes, os, sys
+if os.geteuid() == 0:
+    ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)  # PR_CAPBSET_DROP, CAP_DAC_OVERRIDE
+os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+"""
+"""Takes from root the right to write where nobody may, then starts a program."""
 
 
 @pytest.mark.slow
@@ -296,10 +298,9 @@ def test_a_read_only_folder_is_said(tmp_path, words):
     folder.mkdir(mode=0o555)
     np.save(tmp_path / "pile.npy", np.eye(12, dtype=np.float32))
     done = subprocess.run(
-        [sys.executable, "-m", "jaxsand", *words],
+        [sys.executable, "-c", AS_OTHERS, "-m", "jaxsand", *words],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT), "HOME": "/nowhere"},
-        preexec_fn=as_others,
         capture_output=True,
         check=False,
     )

@@ -22,7 +22,7 @@ SOLID[5:7, 9:11] = True
 PATH = np.array([[0.0413, 0.0627], [0.1131, 0.0842], [0.0727, 0.0311]])
 
 
-def central(f, x, seed=0, e=1e-7):
+def central(f, x, seed=0, e=1e-8):
     """The gradient of f at a tuple x; checked, along one random direction of each argument, both ways."""
     slopes = jax.jit(jax.grad(f, range(len(x))))(*x)
     forward = jax.jit(lambda x, v: jax.jvp(f, x, v))
