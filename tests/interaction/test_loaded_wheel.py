@@ -99,9 +99,10 @@ def test_grousers_give_the_slip():
 # The ground
 
 
+@jax.jit
 def level(height, pose, by, dx=DX, width=0.03, slip=0.0):
-    ground = ground_of(js.make_scene(np.shape(height), dx), jnp.asarray(height))
-    return ground.level(js.Wheel(width=width, slip_angle=slip), js.Pose(*map(jnp.asarray, pose)), jnp.asarray(by))
+    ground = ground_of(js.make_scene(np.shape(height), dx), height)
+    return ground.level(js.Wheel(width=width, slip_angle=slip), js.Pose(*pose), by)
 
 
 def test_the_ground_of_a_plane_is_exact_and_ends_where_the_map_ends():
