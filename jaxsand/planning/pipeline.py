@@ -49,8 +49,8 @@ class ShapeResult:
     Example:
       >>> import numpy as np
       >>> import jaxsand as js
-      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
-      >>> result = js.film(scene, None, np.zeros((16, 16)), [np.array([[0.04, 0.08], [0.12, 0.08]])])
+      >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+      >>> result = js.film(scene, None, np.zeros((8, 8)), [np.array([[0.02, 0.04], [0.06, 0.04]])])
       >>> len(result.frames) == len(result.tools)
       True
     """

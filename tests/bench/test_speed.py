@@ -15,7 +15,7 @@ STEADY = [{"push": {"ratio": 1.0 + 0.01 * k}} for k in range(10)]
 
 
 def test_ratios_are_those_of_the_best_times(monkeypatch):
-    calls, small = {"fast": 0, "slow": 0}, partial(reference, cells=128)
+    calls, small = {"fast": 0, "slow": 0}, partial(reference, 1000, cells=64)
 
     def job(name, work):
         def run():
@@ -25,7 +25,7 @@ def test_ratios_are_those_of_the_best_times(monkeypatch):
         return run
 
     monkeypatch.setattr(speed, "reference", small)
-    monkeypatch.setattr(speed, "jobs", lambda: {"fast": job("fast", 10), "slow": job("slow", 400)})
+    monkeypatch.setattr(speed, "jobs", lambda: {"fast": job("fast", 100), "slow": job("slow", 4000)})
     rows = {row["name"]: row for row in bench_speed(rounds=2)}
     assert calls == {"fast": 3, "slow": 3}
     assert rows["fast"]["ratio"] < 1 < rows["slow"]["ratio"]

@@ -17,7 +17,6 @@ from jaxsand.planning.search.rollouts import Effort
 from tests import conftest
 from tests.cli.conftest import DRAWINGS, SHEET
 
-
 HURRY = " ".join(f"--{name}={str(value).lower()}" for name, value in conftest.HURRY.items())
 
 
