@@ -15,7 +15,7 @@ STEADY = [{"push": {"ratio": 1.0 + 0.01 * k}} for k in range(10)]
 
 
 def test_ratios_are_those_of_the_best_times(monkeypatch):
-    calls, small = {"fast": 0, "slow": 0}, partial(reference, 1000, cells=64)
+    calls, small = {"fast": 0, "slow": 0}, partial(reference, sweeps=1000, cells=64)
 
     def job(name, work):
         def run():
