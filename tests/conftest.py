@@ -10,6 +10,8 @@ import jax
 import numpy as np
 import pytest
 
+from jaxsand.relaxation import batching
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 gc.set_threshold(100_000, 20, 20)  # tracing makes many objects, hardly any of them garbage
@@ -36,6 +38,11 @@ COMPUTING = ("bench", "planning", "terramechanics", "train")
 """XLA's options by a test's marker; slow tests of these rooms are long, too. In a hurry programs are compiled six times as
 fast, and run four times as slowly; by the older emitters alone they are compiled twice as fast, and run as fast, but for a few
 large derivatives, which those take for ever to compile."""
+
+GROUPS = batching.SIZES
+ONE_SIZE = {min(GROUPS): 1.0}
+"""In a hurry, maps are pushed in groups of one size, so that one program is compiled in place of three: the smallest, as so
+compiled twice the maps take twice the time. What judges the groups themselves puts `GROUPS` back."""
 
 _options: dict[str, Any] = {}
 KEPT_BY = "jax_pgle_profiling_runs"  # says nothing to a CPU, but is among what JAX keeps its programs by
@@ -83,6 +90,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     way = _way(item)
     _options.clear()
     _options.update(way)
+    batching.SIZES = ONE_SIZE if way is HURRY else GROUPS
     jax.config.update(KEPT_BY, [HURRY, OLDER, {}].index(way))
 
 

@@ -71,7 +71,7 @@ def test_code_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(path, slow=False)
     if path == README:
-        assert names["batch"].shape == (64, 32, 32)
+        assert names["batch"].shape == (16, 32, 32)
         assert float(abs(names["slope"]).max()) > 0
 
 

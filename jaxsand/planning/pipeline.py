@@ -49,8 +49,8 @@ class ShapeResult:
     Example:
       >>> import numpy as np
       >>> import jaxsand as js
-      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
-      >>> result = js.film(scene, None, np.zeros((16, 16)), [np.array([[0.04, 0.08], [0.12, 0.08]])])
+      >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+      >>> result = js.film(scene, None, np.zeros((8, 8)), [np.array([[0.02, 0.04], [0.06, 0.04]])])
       >>> len(result.frames) == len(result.tools)
       True
     """
@@ -184,11 +184,11 @@ def film(
     Example:
       >>> import numpy as np
       >>> import jaxsand as js
-      >>> scene = js.make_scene((16, 16), 0.01, tool=js.Blade())
-      >>> stroke = np.array([[0.04, 0.08], [0.12, 0.08]])
-      >>> result = js.film(scene, None, np.zeros((16, 16)), [stroke])
+      >>> scene = js.make_scene((8, 8), 0.01, tool=js.Blade())
+      >>> stroke = np.array([[0.02, 0.04], [0.06, 0.04]])
+      >>> result = js.film(scene, None, np.zeros((8, 8)), [stroke])
       >>> result.steps, result.after.shape
-      (1, (16, 16))
+      (1, (8, 8))
     """
     wanted, blade = as_goal(scene, goal), blade_of(scene)
     ways = tuple(np.asarray(path, np.float32) for path in paths)

@@ -14,11 +14,14 @@ from PIL import Image
 from jaxsand.__main__ import main
 from jaxsand.goals.metrics import volume_error
 from jaxsand.planning.search.rollouts import Effort
+from tests import conftest
 from tests.cli.conftest import DRAWINGS, SHEET
+
+HURRY = " ".join(f"--{name}={str(value).lower()}" for name, value in conftest.HURRY.items())
 
 
 def run(*arguments, environment=None, **options):
-    environment = os.environ | {"PYTHONWARNINGS": "error"} | (environment or {})
+    environment = os.environ | {"PYTHONWARNINGS": "error", "XLA_FLAGS": HURRY} | (environment or {})
     return subprocess.run(
         [sys.executable, "-m", "jaxsand", *arguments],
         capture_output=True,

@@ -42,7 +42,9 @@ def digging(**options):
     return gymnasium.make(jaxsand.gym.EXCAVATE, **DIGS | options)
 
 
-@pytest.mark.parametrize("make", [single, multi, pytest.param(rising, marks=SLOW), digging])
+@pytest.mark.parametrize(
+    "make", [single, pytest.param(multi, marks=pytest.mark.wide), pytest.param(rising, marks=SLOW), digging]
+)
 def test_gymnasium_finds_nothing_wrong(make):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*(infinity|render_fps).*")  # heights have no bounds

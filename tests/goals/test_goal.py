@@ -108,7 +108,7 @@ def test_bounds_of_weighted_goals_hold():
     assert volume_distance(SCENE, LEVEL, as_goal(SCENE, js.Goal(LEVEL + 0.01, above=0.0))) > 0
 
 
-@pytest.mark.parametrize("power", [1, 2])
+@pytest.mark.parametrize("power", [1, pytest.param(2, marks=pytest.mark.wide)])
 def test_one_stroke_gains_no_more_than_the_weighted_bound(power):
     scene = js.make_scene((20, 24), 0.01, tool=js.Blade())
     level, far, weight = np.zeros((20, 24)), np.zeros((20, 24)), np.ones((20, 24))

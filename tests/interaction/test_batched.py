@@ -10,6 +10,9 @@ import pytest
 
 import jaxsand as js
 from jaxsand.interaction.batched import act_batch
+from jaxsand.relaxation import batching
+
+from ..conftest import GROUPS
 
 QUICK = {"push": js.SteppedPush(1.0, 2), "stop": js.Sweeps(8)}
 SAND = js.make_scene((9, 9), 0.01, 0.5, tool=js.Blade(0.025, 0.015, 0.006))
@@ -17,6 +20,11 @@ RNG = np.random.default_rng(0)
 MAPS = RNG.normal(0, 1e-3, (5, 9, 9))
 STROKES = RNG.uniform(0.02, 0.07, (5, 4))
 WEIGHTS = RNG.normal(size=(5, 9, 9))
+
+
+@pytest.fixture(autouse=True)
+def _groups(monkeypatch):
+    monkeypatch.setattr(batching, "SIZES", GROUPS)
 
 
 def weighed(height, weight):

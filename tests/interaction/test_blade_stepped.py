@@ -214,7 +214,7 @@ def test_the_result_is_continuous_in_the_stroke():
 
 
 def test_a_stroke_that_is_not_finite_is_flagged():
-    out = js.step(scene(), level(), (0.1, 0.1, np.nan, 0.2))
+    out = js.step(scene(), level("float32"), (0.1, 0.1, np.nan, 0.2))
     assert int(out.outcome) == js.Outcome.NOT_FINITE
     assert np.array_equal(out.height, level())
 

@@ -84,7 +84,8 @@ def test_bed_and_bucket_keep_their_sand_in_float32(count, most):
     """Drift is 1.2e-8 after 3,000 actions: a column poured on a point is so tall that fine heights round as it settles."""
     rng = np.random.default_rng(1)
     scene = js.make_scene((N, N), DX, ANGLE, tool=js.Bucket(0.06, 0.04, 6e-5))
-    height, load = jnp.asarray(ROUGH, jnp.float32), None
+    none = jnp.zeros((), jnp.float32)
+    height, load = jnp.asarray(ROUGH, jnp.float32), js.Load(none, none)
     before = float(np.asarray(height, float).sum())
     for k in range(count):
         path = rng.uniform([-0.02, -0.02, -0.015], [0.26, 0.26, 0.005], (2, 3))

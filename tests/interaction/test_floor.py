@@ -48,8 +48,11 @@ def test_a_blade_clears_a_layer_off_its_floor(neighbours):
 
 @pytest.mark.parametrize(
     "tool",
-    [js.Blade(0.06, 0.015, 0.05), js.Blade(0.06, 0.015, 0.05, yaw=0.4), js.Wheel(0.06, 0.04, 0.03)],
-    ids=["blade", "at an angle", "wheel"],
+    [
+        pytest.param(js.Blade(0.06, 0.015, 0.05), id="blade"),
+        pytest.param(js.Blade(0.06, 0.015, 0.05, yaw=0.4), id="at an angle", marks=pytest.mark.wide),
+        pytest.param(js.Wheel(0.06, 0.04, 0.03), id="wheel"),
+    ],
 )
 def test_no_tool_cuts_the_floor(tool):
     rock, stroke = rough(4, 0.06) - 0.06, [0.06, 0.07, 0.14, 0.12]

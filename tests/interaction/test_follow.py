@@ -19,18 +19,23 @@ LEVEL = np.zeros(SHAPE)
 START, CORNER, END = (0.1, 0.1), (0.25, 0.1), (0.25, 0.22)
 
 
+def stroked(start, stop, height=LEVEL):
+    """One leg, of the program of two: the path's repeated end changes nothing."""
+    return js.follow(SAND, height, [start, stop, stop])
+
+
 @pytest.mark.wide
 def test_two_points_are_a_stroke():
     assert np.array_equal(js.follow(SAND, LEVEL, [START, CORNER]).height, js.step(SAND, LEVEL, (*START, *CORNER)).height)
 
 
 def test_a_point_on_the_way_changes_little_and_the_heap_goes_along():
-    whole = js.follow(SAND, LEVEL, [START, CORNER])
+    whole = stroked(START, CORNER)
     halves = js.follow(SAND, LEVEL, [START, (0.175, 0.1), CORNER])
     js.check(halves)
     # Only where a sub-step is cut in two.
     assert np.abs(halves.height - whole.height).max() < 0.02 * np.abs(whole.height).max()
-    lifted = js.step(SAND, js.step(SAND, LEVEL, (*START, 0.175, 0.1)).height, (0.175, 0.1, *CORNER))
+    lifted = stroked((0.175, 0.1), CORNER, stroked(START, (0.175, 0.1)).height)
     assert np.abs(lifted.height - whole.height).max() > 0.1 * np.abs(whole.height).max()
 
 
@@ -60,7 +65,7 @@ def test_at_a_corner_the_blade_turns_in_place_and_leaves_its_heap():
 
 def test_at_a_reversal_the_heap_stays_behind_and_the_trench_is_cleaned():
     out = js.follow(SAND, LEVEL, [START, CORNER, START])
-    once = js.follow(SAND, LEVEL, [START, CORNER])
+    once = stroked(START, CORNER)
     h = np.asarray(out.height)
     row = int(0.1 / DX)
     assert h[row, int(0.28 / DX)] == pytest.approx(float(once.height[row, int(0.28 / DX)]), abs=1e-3)

@@ -21,7 +21,7 @@ def sand(walls=WALLS, neighbours=8, **sizes):
     return js.make_scene(SHAPE, DX, ANGLE, neighbours, tool=bucket)
 
 
-@pytest.mark.parametrize("neighbours", [8, "isotropic"])
+@pytest.mark.parametrize("neighbours", [8, pytest.param("isotropic", marks=pytest.mark.wide)])
 def test_a_full_bucket_holds_what_its_walls_do_and_a_heap_upon_it(neighbours):
     """W L walls, and of an overfilled table W <= L, mu W^2 (3 L - W) / 12; the rest lies beside it."""
     scene = sand(neighbours=neighbours)

@@ -92,16 +92,17 @@ def test_grousers_give_the_slip():
     driven = js.Wheel(0.03, 0.03, grousers=js.Grousers(spin=1.25), load=LOAD)
     from jaxsand.scene.tools import sunk
 
-    assert float(sunk(driven)[0].sinkage) == pytest.approx(SINKAGE, rel=1e-12)
+    assert float(jax.jit(lambda wheel: sunk(wheel)[0].sinkage)(driven)) == pytest.approx(SINKAGE, rel=1e-12)
     assert len(jax.tree.leaves(js.Wheel())) == 4  # as of a wheel that knows of no loads
 
 
 # The ground
 
 
+@jax.jit
 def level(height, pose, by, dx=DX, width=0.03, slip=0.0):
-    ground = ground_of(js.make_scene(np.shape(height), dx), jnp.asarray(height))
-    return ground.level(js.Wheel(width=width, slip_angle=slip), js.Pose(*map(jnp.asarray, pose)), jnp.asarray(by))
+    ground = ground_of(js.make_scene(np.shape(height), dx), height)
+    return ground.level(js.Wheel(width=width, slip_angle=slip), js.Pose(*pose), by)
 
 
 def test_the_ground_of_a_plane_is_exact_and_ends_where_the_map_ends():

@@ -53,20 +53,19 @@ def rolled(push, start=None, stroke=STROKE, sand=None):
     return np.asarray(out.height)
 
 
-@pytest.mark.long
 @both
 def test_volume_is_kept(dtype, push):
     """In a corner a wheel heaps up columns of half a metre, whose float32 are coarser than the quanta."""
     corner = (0.39, 0.05, 0.39, 0.4)
-    strokes = (STROKE, SLANTED, (0.02, 0.01, 0.3, 0.03), corner, (-0.3, 0.2, 0.9, 0.25), (0.2, 0.2) * 2)
-    for slip in (0, -0.1, 0.7, math.pi / 2):
-        for stroke in strokes:
-            coarse = 1e-7 if stroke == corner and dtype == "float32" else 0
-            for start, limit in ((level(dtype), coarse), (rough(dtype), LIMIT[dtype])):
-                h = rolled(push, start, stroke, scene(slip))
-                assert volume_error(start, h) <= limit
-                assert not np.array_equal(start, h)
-                assert np.abs(h).max() < 0.06
+    strokes = (STROKE, SLANTED, (0.02, 0.01, 0.3, 0.03), (-0.3, 0.2, 0.9, 0.25), (0.2, 0.2) * 2)
+    slips, dunes = (0, -0.1, 0.7, math.pi / 2), rough(dtype)
+    for slip, stroke in [*zip((*slips, 0.7), strokes, strict=True), (0, corner), (0.7, corner)]:
+        coarse = 1e-7 if stroke == corner and dtype == "float32" else 0
+        for start, limit in ((level(dtype), coarse), (dunes, LIMIT[dtype])):
+            h = rolled(push, start, stroke, scene(slip))
+            assert volume_error(start, h) <= limit
+            assert not np.array_equal(start, h)
+            assert np.abs(h).max() < 0.06
 
 
 @pytest.mark.wide

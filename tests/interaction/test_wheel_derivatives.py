@@ -67,7 +67,7 @@ def test_gradients(push):
             assert float(jnp.sum(g[i] * v)) == pytest.approx((up - down) / 2e-8, rel=1e-5, abs=1e-6), name
     ends = [(jnp.asarray(s), *at[1:]) for s in ([0.1, 0.06, 0.1, 0.06], [5.0, 5.0, 6.0, 6.0], [0.1, 0.06, 5.0, 0.06])]
     for slip, sinkage in ((0.0, 0.0122), (math.pi / 2, 0.0122), (0.3, 0.041), (0.0, 1e-6)):
-        ends.append((*at[:3], jnp.asarray(sinkage), jnp.asarray(slip), at[5]))
+        ends.append((*at[:3], jnp.asarray(sinkage, float), jnp.asarray(slip, float), at[5]))
     for end in ends:
         assert all(np.all(np.isfinite(v)) for v in value_and_grad(*end)[1])
     assert not np.any(value_and_grad(*ends[1])[1][0])

@@ -24,7 +24,7 @@ X, Y = np.meshgrid((np.arange(20) + 0.5) * 0.02, (np.arange(12) + 0.5) * 0.02)
 INSIDE = (X > 0.08) & (X < 0.3) & (Y > 0.06) & (Y < 0.16)
 RAMP = np.where(INSIDE, 0.2 * (X - 0.19), np.nan)
 WANTED = as_goal(SCENE, RAMP)
-BUDGET = 120
+BUDGET = 60
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +118,7 @@ def test_a_search_with_heights_costs_no_more_than_its_budget(monkeypatch, budget
         assert len(found) <= strokes
 
 
-@pytest.mark.parametrize("strokes", [2, 6])
+@pytest.mark.parametrize("strokes", [2, pytest.param(6, marks=pytest.mark.wide)])
 def test_gradients_in_a_search_cost_no_more_than_its_budget(monkeypatch, strokes):
     """Each counts as five pushes; they are left out with few pushes, and for few steps; strokes stay as they are allowed."""
     pushes, gradients, rng = [], [], np.random.default_rng(0)
@@ -257,9 +257,9 @@ def test_bad_input(actions, message):
 def test_of_several_blades_the_one_that_suits_is_chosen():
     """A wide one levels a ramp that a narrow one only scratches; what is tried counts, and the plan is that blade's."""
     narrow, wide = js.Blade(width=0.02, thickness=0.03, depth=0.0), SCENE.tool
-    found = js.plan_sand(SCENE, LEVEL, RAMP, strokes=2, actions=js.Rising(), budget=40, tools=(narrow, wide))
+    found = js.plan_sand(SCENE, LEVEL, RAMP, strokes=2, actions=js.Rising(), budget=24, tools=(narrow, wide))
     assert found.tool == wide
-    assert found.effort.cost <= 40
+    assert found.effort.cost <= 24
     np.testing.assert_array_equal(replay(SCENE, LEVEL, found.paths), found.height)
     with pytest.raises(ValueError, match=r"tools: got a choice with Lattice\(\)"):
         js.plan_sand(SCENE, LEVEL, RAMP, tools=(narrow, wide))

@@ -119,8 +119,8 @@ def heaps(many=24):
 @pytest.mark.parametrize(
     ("scheme", "neighbours"),
     [
-        pytest.param(s, n, marks=() if n == alone else pytest.mark.slow)
-        for s, alone in ((js.Relaxation(), 8), (js.SuperTimeStepping(), 4))
+        pytest.param(s, n, marks=mark if n == alone else pytest.mark.slow)
+        for s, alone, mark in ((js.Relaxation(), 8, ()), (js.SuperTimeStepping(), 4, pytest.mark.wide))
         for n in (4, 8, "isotropic")
     ],
 )

@@ -181,7 +181,6 @@ def test_the_grids_error_of_a_push_is_told():
         assert 0 < found.noise_errors[name] < found.grid_errors[name] < found.errors[name] < found.values[name] / 3
 
 
-@pytest.mark.long
 def test_the_errors_are_the_cramer_rao_bound():
     """sigma over the length of the derivative, of the cells that were seen."""
     after = collapsed(29).copy()
@@ -220,7 +219,6 @@ def test_what_the_data_do_not_tell_is_said():
     assert found.covariance[1, 1] == math.inf
 
 
-@pytest.mark.long
 def test_a_wrong_model_is_said():
     """A pillar a tenth higher than it is said to be; and a range that does not hold the truth."""
     trial = js.Trial(PILLAR, collapsed(29, PILLAR * 1.1) + noise(4))

@@ -142,7 +142,7 @@ def test_a_wheel_at_a_height_feels_its_sinkage_in_the_ground_as_found():
 def test_a_bucket_feels_its_cut():
     """An edge that takes up all that it cuts has no heap ahead: the force is that of the cut."""
     scene = js.make_scene(BED, DX, ANGLE, tool=js.Bucket(0.04, 0.02, 1.0, depth=DEEP))
-    loaded, trace = follow_forces(scene, np.zeros(BED), PATH, CLEAN, substeps=4)
+    loaded, trace = feel(scene, np.zeros(BED), PATH, CLEAN, substeps=4)
     bare = float(cut(CLEAN, Cut(DEEP, 0.04, sides=2.0)).draught)
     np.testing.assert_allclose(-trace.force[:, 0], bare, rtol=0.02)
     assert float(js.load_volume(scene, loaded.load)) == pytest.approx(WAY * DEEP * 0.02, rel=1e-6)
