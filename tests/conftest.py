@@ -78,6 +78,19 @@ def _hurried(item: pytest.Item) -> bool:
     return hasattr(item, "callspec") and item.callspec.params.get("both_ways") == "hurried"
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Workers take the files in their order, the long ones of `fuzz` early, not those of few tests last."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _little_to_look_through() -> None:
+    """What earlier files left, compiled programs above all, is no garbage, and need not be looked through for it again."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = [item for item in items if not (_hurried(item) and item.get_closest_marker("slow"))]
 

@@ -51,10 +51,8 @@ def test_sweeps_around_a_tool_that_stands_in_the_sand():
 
 
 WAYS = {
-    "walls": {"walls": SOLID},
-    "angles in a window": {"window": js.Window((12, 12), 1.0), "angle": ANGLES},
-    "straight neighbours": {"neighbours": 4},
-    "draining": {"edge": js.Draining(-0.003)},
+    "walls and a draining edge": {"walls": SOLID, "edge": js.Draining(-0.003)},
+    "angles and straight neighbours in a window": {"window": js.Window((12, 12), 1.0), "angle": ANGLES, "neighbours": 4},
     "isotropic": {"neighbours": "isotropic"},
 }
 
