@@ -26,11 +26,12 @@ def rough(seed: int, span: float, cells: int = 20) -> np.ndarray:
     return span * (walk - walk.min()) / np.ptp(walk)
 
 
-ROOM = 30_000  # of the 65,530 pieces of memory that Linux lets a process map, of which every program takes some
+ROOM = 50_000  # of the 65,530 pieces of memory that Linux lets a process map, of which every program takes some
 HURRY = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_parallel_codegen_split_count": 1,
 }
 OLDER = {"xla_cpu_use_fusion_emitters": False}
 WAYS = {"compiled": {}, "long": OLDER}
@@ -44,8 +45,15 @@ ONE_SIZE = {min(GROUPS): 1.0}
 """In a hurry, maps are pushed in groups of one size, so that one program is compiled in place of three: the smallest, as so
 compiled twice the maps take twice the time. What judges the groups themselves puts `GROUPS` back."""
 
-_options: dict[str, Any] = {}
 KEPT_BY = "jax_pgle_profiling_runs"  # says nothing to a CPU, but is among what JAX keeps its programs by
+_options: dict[str, Any] = {}
+
+
+def _compile(way: dict[str, Any]) -> None:
+    """From here on, programs are compiled so, and kept apart from others."""
+    _options.clear()
+    _options.update(way)
+    jax.config.update(KEPT_BY, [HURRY, OLDER, {}].index(way))
 
 
 def _hurry() -> None:
@@ -66,6 +74,7 @@ def _hurry() -> None:
 
 
 _hurry()
+_compile(HURRY)  # what modules compute when they are imported
 
 
 def _way(item: pytest.Item) -> dict[str, Any]:
@@ -101,10 +110,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if maps.exists() and maps.read_bytes().count(b"\n") > ROOM:
         jax.clear_caches()
     way = _way(item)
-    _options.clear()
-    _options.update(way)
+    _compile(way)
     batching.SIZES = ONE_SIZE if way is HURRY else GROUPS
-    jax.config.update(KEPT_BY, [HURRY, OLDER, {}].index(way))
 
 
 def turned(stroke: Sequence[float], side: float) -> list[tuple[Callable, tuple[float, ...]]]:
