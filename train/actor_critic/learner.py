@@ -93,7 +93,7 @@ class ActorCritic:
         maps = jnp.zeros((1, *SHAPE), jnp.float32)
         params = jax.jit(self.net.init)(jax.random.key(seed), maps, maps, jnp.ones((1, 1, 4), jnp.float32))
         memory = empty(self.capacity, self.tries)
-        return Skill(params, params, _optimiser().init(params), memory, jnp.int32(0), jnp.int32(seed))
+        return Skill(params, params, jax.jit(_optimiser().init)(params), memory, jnp.int32(0), jnp.int32(seed))
 
     def advance(self, state: Skill) -> tuple[Skill, dict[str, float]]:
         """One chunk of practice and updates.

@@ -86,7 +86,7 @@ class Hindsight:
         """The state before the first chunk."""
         maps = jnp.zeros((1, SHAPE[0], SHAPE[0]))
         params = jax.jit(self.net.init)(jax.random.key(seed), maps, maps, jnp.zeros((1, 1, 4)))
-        return Progress(params, params, _optimiser().init(params), jnp.int32(0), jnp.int32(seed))
+        return Progress(params, params, jax.jit(_optimiser().init)(params), jnp.int32(0), jnp.int32(seed))
 
     def advance(self, state: Progress) -> tuple[Progress, dict[str, float]]:
         """One chunk of lessons.

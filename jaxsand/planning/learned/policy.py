@@ -140,7 +140,7 @@ def _loaded(path: Path) -> Policy:
         raise ValueError(f"policy: {path} holds no parameters of this version's network; {_REMEDY}")
     if other := next((name for name, x in arrays.items() if x.dtype.kind != "f" or not np.isfinite(x).all()), None):
         raise ValueError(f"policy: {path} holds no finite numbers as {other}; {_REMEDY}")
-    flat = {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items()}
+    flat = jax.device_put({name: x.astype(np.float32) for name, x in arrays.items()})  # a program less for every shape
     return Policy(net, traverse_util.unflatten_dict(flat, sep="/"))
 
 
