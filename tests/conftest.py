@@ -35,7 +35,7 @@ HURRY = {
 }
 OLDER = {"xla_cpu_use_fusion_emitters": False}
 WAYS = {"compiled": {}, "long": OLDER}
-COMPUTING = ("bench", "planning", "terramechanics", "train")
+COMPUTING = ("planning", "terramechanics", "train")
 """XLA's options by a test's marker; slow tests of these rooms are long, too. In a hurry programs are compiled six times as
 fast, and run four times as slowly; by the older emitters alone they are compiled twice as fast, and run as fast, but for a few
 large derivatives, which those take for ever to compile."""

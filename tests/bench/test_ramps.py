@@ -19,6 +19,7 @@ RAMP = np.where((X > 0.08) & (X < 0.3) & (Y > 0.06) & (Y < 0.16), 0.2 * (X - 0.1
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_bench_tells_errors_of_what_is_built():
     """Of a ramp from its foot the mean error is half its rise at first, from half its height a quarter, but for the odd row."""
     assert ramp("", 0.03, 0.0, {}).error(np.zeros((16, 32))) == pytest.approx(15 - 1 / 15)

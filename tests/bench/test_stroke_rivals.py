@@ -105,6 +105,7 @@ def test_many_plans_at_once_leave_what_the_simulator_leaves(bar):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_push_that_touches_its_window_is_pushed_again_on_the_whole_map(bar, monkeypatch):
     small = replace(bar.scene, window=Window((6, 6)))
     assert int(js.step_batch(small, bar.start[None], bar.strokes[:1]).outcome[0]) == Outcome.WINDOW_EDGE
@@ -182,6 +183,7 @@ def test_the_command_prints_writes_and_draws(bar, tmp_path, capsys, monkeypatch)
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_goals_of_other_kinds():
     turned = turned_letters("I", 90)[0]
     np.testing.assert_allclose(turned.strokes, [[0.265, 0.16, 0.055, 0.16]], atol=1e-9)

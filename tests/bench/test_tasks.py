@@ -12,6 +12,7 @@ from jaxsand.goals.tasks import figures, make_task
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_rows_tell_what_methods_leave_and_spend():
     rows = bench_tasks(names=("rectangle",), methods=METHODS, pushes=120)["tasks"]
     assert [row["method"] for row in rows] == [*METHODS]
