@@ -95,9 +95,10 @@ def test_goals_that_are_none_are_named(goals, message):
 
 @pytest.mark.slow
 def test_gradients_bring_a_ramp_closer(found):
-    refined = js.optimise_strokes(SCENE, RAMP, guess=found.strokes, budget=2 * 5 * 20)
+    """Some 140 pushes go to the strokes' order and direction first."""
+    refined = js.optimise_strokes(SCENE, RAMP, guess=found.strokes, budget=600)
     assert refined.losses[-1] < 0.9 * found.after**2
-    assert refined.spent <= 200
+    assert refined.spent <= 600
 
 
 @pytest.mark.parametrize("budget", [1, 3, 10, 41, 200])
