@@ -144,7 +144,7 @@ def _on_sand(policy: "Proposes", options: argparse.Namespace, tell: Tell, out: P
     """Evaluates a policy on glyphs, and writes report and picture if asked."""
     from jaxsand.planning.learned.stages import Stages
     from train.evaluation.glyphs import SETS, read_glyphs
-    from train.evaluation.scores import evaluate, page, picture
+    from train.evaluation.scores import evaluate, page, picture, replayed
 
     if options.goals is not None and options.goals not in SETS:
         raise ValueError(f"goals: got {options.goals!r}; give one of {', '.join(SETS)}")
@@ -155,10 +155,11 @@ def _on_sand(policy: "Proposes", options: argparse.Namespace, tell: Tell, out: P
         from jaxsand.viz.render import save_figure
 
         write_json(out / _REPORT, report)
+        maps = replayed(glyphs, report)
         with written(out / "evaluate.png") as path:
-            save_figure(lambda: picture(glyphs, report), path)
+            save_figure(lambda: picture(glyphs, report, maps), path)
         if options.html:
-            page(glyphs, report).to_html(out / "evaluate.html")
+            page(glyphs, report, maps).to_html(out / "evaluate.html")
     return report
 
 

@@ -11,7 +11,7 @@ from jaxsand.bench.stroke_goals import letters
 from jaxsand.planning.learned.stages import Stages
 from train.curves import curve, curves_figure, main
 from train.evaluation.glyphs import SETS, read_glyphs
-from train.evaluation.scores import evaluate, judged, page, picture
+from train.evaluation.scores import evaluate, judged, page, picture, replayed
 
 GLYPHS = letters("LT")
 
@@ -46,9 +46,10 @@ def test_a_policy_that_knows_the_strokes_gets_all_right():
         assert row["iou"] > 0.99
         np.testing.assert_allclose(row["pushes"], glyph.strokes, atol=1e-6)
     json.dumps(report)
-    assert picture(GLYPHS, report).axes
+    assert picture(GLYPHS, report, replayed(GLYPHS, report)).axes
     odd = replace(GLYPHS[0], name=r"$\frac$")  # no formula, but what a user called it
-    drawn = picture([odd], {"glyphs": {odd.name: report["glyphs"][GLYPHS[0].name]}})
+    of_odd = {"glyphs": {odd.name: report["glyphs"][GLYPHS[0].name]}}
+    drawn = picture([odd], of_odd, replayed([odd], of_odd))
     drawn.savefig(BytesIO())
     assert drawn.axes[0].get_title().startswith(odd.name)
 
@@ -68,7 +69,8 @@ def test_no_push_changes_nothing():
 def test_a_page_shows_each_glyph_after_each_push_beside_its_goal():
     glyph = GLYPHS[0]
     row = judged(glyph, glyph.strokes)
-    shown = page([glyph], {"glyphs": {glyph.name: row}, "right": 1, "total": 1})
+    report = {"glyphs": {glyph.name: row}, "right": 1, "total": 1}
+    shown = page([glyph], report, replayed([glyph], report))
     (panel,) = shown.panels
     assert (shown.title, panel.title, panel.spacing) == ("1 of 1 right", "L*: IoU 1.000", 0.01)
     assert panel.heights.shape == (len(glyph.strokes) + 1, *glyph.goal.shape)

@@ -1,7 +1,6 @@
 """How many glyphs a policy gets right: alone, with look-ahead by the simulator, and after refinement by gradients."""
 
 import time
-from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -67,38 +66,42 @@ def judged(glyph: StrokeGoal, pushes: np.ndarray) -> dict[str, Any]:
     }
 
 
-def picture(glyphs: list[StrokeGoal], report: dict[str, Any]) -> "Figure":
-    """Goals, and below each what the pushes of a report left, with its IoU; a star where it is right."""
+def replayed(glyphs: list[StrokeGoal], report: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The maps [M + 1, H, W] (m) of each glyph by name: its start, and what each of a report's M pushes left."""
+    return {glyph.name: _replayed(glyph, _ways(report["glyphs"][glyph.name])) for glyph in glyphs}
+
+
+def picture(glyphs: list[StrokeGoal], report: dict[str, Any], maps: dict[str, np.ndarray]) -> "Figure":
+    """Goals, and below each what was left of `replayed` maps, with its IoU; a star where it is right."""
     return found_figure(
         [
-            (name, row["iou"], glyph.goal - glyph.start, maps[-1] - glyph.start)
-            for name, row, glyph, maps in _pushed(glyphs, report)
+            (_starred(g, row), row["iou"], g.goal - g.start, maps[g.name][-1] - g.start)
+            for g, row in ((g, report["glyphs"][g.name]) for g in glyphs)
         ]
     )
 
 
-def page(glyphs: list[StrokeGoal], report: dict[str, Any]) -> Page:
-    """Sand to turn and play in a browser: every glyph after each of its pushes, beside its goal."""
+def page(glyphs: list[StrokeGoal], report: dict[str, Any], maps: dict[str, np.ndarray]) -> Page:
+    """Sand to turn and play in a browser: every glyph's `replayed` maps, beside its goal."""
     return view(
         *[
-            Panel(maps, float(glyph.scene.grid.spacing), f"{name}: IoU {row['iou']:.3f}", glyph.goal, _ways(row))
-            for name, row, glyph, maps in _pushed(glyphs, report)
+            Panel(maps[g.name], float(g.scene.grid.spacing), f"{_starred(g, row)}: IoU {row['iou']:.3f}", g.goal, _ways(row))
+            for g, row in ((g, report["glyphs"][g.name]) for g in glyphs)
         ],
         title=f"{report['right']} of {report['total']} right",
     )
+
+
+def _replayed(glyph: StrokeGoal, ways: tuple[np.ndarray, ...]) -> np.ndarray:
+    maps = [np.asarray(glyph.start, np.float32)]
+    for way in ways:
+        maps.append(pushed(glyph.scene, maps[-1][None], way.reshape(1, 4))[0])
+    return np.stack(maps)
 
 
 def _ways(row: dict[str, Any]) -> tuple[np.ndarray, ...]:
     return tuple(np.array(row["pushes"], float).reshape(-1, 2, 2))
 
 
-def _pushed(
-    glyphs: list[StrokeGoal], report: dict[str, Any]
-) -> Iterator[tuple[str, dict[str, Any], StrokeGoal, np.ndarray]]:
-    """Each glyph's name, with a star where it is right, its row of the report, and its maps [M + 1, H, W] (m)."""
-    for glyph in glyphs:
-        row = report["glyphs"][glyph.name]
-        maps = [np.asarray(glyph.start, np.float32)]
-        for way in _ways(row):
-            maps.append(pushed(glyph.scene, maps[-1][None], way.reshape(1, 4))[0])
-        yield f"{glyph.name}*" if row["right"] else glyph.name, row, glyph, np.stack(maps)
+def _starred(glyph: StrokeGoal, row: dict[str, Any]) -> str:
+    return f"{glyph.name}*" if row["right"] else glyph.name
