@@ -120,7 +120,7 @@ def _own(options: argparse.Namespace) -> dict[str, Any]:
         if getattr(options, option) is not None and options.what not in where:
             raise ValueError(f"{option}: has an effect on {' and '.join(f'bench {w}' for w in where)} only; leave it out")
     if options.what == "tools":
-        return {"points": options.points} if options.points else {}
+        return {"out": options.out} | ({"points": options.points} if options.points else {})
     if options.what not in ("strokes", "tasks"):
         return {}
     methods = tuple(name.strip() for name in options.methods.split(",")) if options.methods else ()

@@ -188,7 +188,10 @@ def _bench(commands: Any) -> None:
     p.add_argument("--points", type=count, metavar="N", help="tools: smooth points a tool to check gradients at (64)")
     p.add_argument("--strokes", type=count, metavar="N", help="tasks: at most so many strokes (each task's own number)")
     p.add_argument(
-        "--out", type=path_name, metavar="DIR", help="folder for the report and its figure; strokes and tasks go on there"
+        "--out",
+        type=path_name,
+        metavar="DIR",
+        help="folder for the report and its figure; strokes, tasks and tools go on there",
     )
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(run=run_benchmark)

@@ -35,6 +35,30 @@ def test_a_search_in_vain_ends(monkeypatch):
     assert (row["tried"], row["smooth"], row["float64_median"]) == (128, 0, None)
 
 
+def test_a_run_that_was_cut_off_goes_on(monkeypatch, tmp_path):
+    """Rows of as many points of the same tools are kept; what was cut off, and rows of other numbers, are computed."""
+    drawn = []
+
+    def errors(tell, case, points, cells):
+        drawn.append((case.name, points))
+        return {"tried": points}
+
+    monkeypatch.setattr(tools, "_errors", errors)
+    monkeypatch.setattr(tools, "costs_of_tools", lambda *_: [])
+    first = tools.bench_tools(print, 8, SMALL[:1], out=tmp_path)["gradient_of_tools"]
+    with (tmp_path / "tools.jsonl").open("a") as file:
+        file.write('{"name": "settle, 4 n')
+    both = tools.bench_tools(print, 8, SMALL, out=tmp_path)["gradient_of_tools"]
+    assert [row["name"] for row in both] == [case.name for case in SMALL]
+    assert both[0] == first[0]
+    assert tools.bench_tools(print, 8, SMALL, out=tmp_path)["gradient_of_tools"] == both
+    assert drawn == [(case.name, 8) for case in SMALL]
+    assert tools.bench_tools(print, 9, SMALL[:1], out=tmp_path)["gradient_of_tools"][0]["points"] == 9
+    (tmp_path / "tools.jsonl").write_text('{"task": "ramp"}')
+    with pytest.raises(ValueError, match="out: line 1 of .* is no row of this bench"):
+        tools.bench_tools(print, 8, SMALL, out=tmp_path)
+
+
 @pytest.mark.wide
 def test_costs_are_told_beside_the_first():
     rows = tools.costs_of_tools(print, SMALL, 12, 2, 1)
