@@ -73,12 +73,12 @@ class SandLoss:
 
     def __call__(self, candidates: np.ndarray) -> np.ndarray:
         """The losses [P] of plans [P, N, 4] (m)."""
-        return self._loss(self.maps(candidates))
+        return self.costs(self.maps(candidates))
 
     def after(self, maps: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The losses [P] and the maps [P, H, W] after one more stroke [P, 4] (m) on each of `maps` [P, H, W]."""
         maps = pushed(self.scene, maps, strokes)
-        return self._loss(maps), maps
+        return self.costs(maps), maps
 
     def maps(self, candidates: np.ndarray) -> np.ndarray:
         """The maps [P, H, W] that plans [P, N, 4] leave; NaN where an outcome is not clean."""
@@ -138,9 +138,10 @@ class SandLoss:
 
     def loss_of(self, height: np.ndarray) -> float:
         """The cost of a map [H, W] (m)."""
-        return float(self._loss(height))
+        return float(self.costs(height))
 
-    def _loss(self, maps: np.ndarray) -> np.ndarray:
+    def costs(self, maps: np.ndarray) -> np.ndarray:
+        """The costs of maps [..., H, W] (m); infinite for a map that is not finite."""
         cost = self.goal.cost(maps.astype(float))
         return np.where(np.isnan(cost), np.inf, cost)
 

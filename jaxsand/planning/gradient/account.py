@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from jaxsand.planning.around import Around
 from jaxsand.planning.stroke_loss import GRADIENT, Best, SandLoss
 from jaxsand.scene.progress import Tell, quiet
 
@@ -18,6 +19,7 @@ class Account:
     tell: Tell = quiet
     calls: int = 0
     history: list[Best] = field(default_factory=list)
+    near: Around | None = None
 
     @property
     def before(self) -> float:
@@ -43,6 +45,27 @@ class Account:
             self._note(some, out[: len(some)])
         return out
 
+    def around(self, plan: np.ndarray) -> Around:
+        """A plan [N, 4], pushed, for `varied`; the last one is kept."""
+        if self.near is None or not np.array_equal(self.near.plan, plan):
+            self.calls += len(plan)
+            self.near = Around(self.sand, plan)
+        return self.near
+
+    def left(self, near: Around, plans: np.ndarray) -> np.ndarray:
+        """The maps [P, H, W] that plans [P, N, 4] like one leave; NaN for plans beyond the budget, which are not pushed."""
+        some, before = plans[near.most(plans).cumsum() <= self.budget - self.calls], near.calls
+        maps = np.full((len(plans), *self.sand.start.shape), np.nan, np.float32)
+        maps[: len(some)] = near.left(some)
+        self.calls += near.calls - before
+        return maps
+
+    def varied(self, near: Around, plans: np.ndarray) -> np.ndarray:
+        """Like `losses`, of plans that are like one that has been pushed, for fewer calls."""
+        losses = self.sand.costs(self.left(near, plans))
+        self._note(plans, losses)
+        return losses
+
     def gradient(self, plans: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
         """The losses [P] of plans [P, N, 4] or [P, N, 6], and the gradients of those of maps blurred by `blur` cells."""
         self.calls += len(plans) * plans.shape[1] * (1 + GRADIENT)
@@ -61,11 +84,6 @@ class Account:
     def afford(self, plans: np.ndarray) -> bool:
         """Whether the budget has room for a gradient of all the plans."""
         return self.room(plans.shape[1]) >= len(plans) * (1 + GRADIENT)
-
-    def maps(self, plans: np.ndarray) -> np.ndarray:
-        """The maps that plans [P, N, 4] leave."""
-        self.calls += len(plans) * plans.shape[1]
-        return self.sand.maps(plans)
 
     def after(self, height: np.ndarray, strokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The losses [P] and the maps [P, H, W] after each of the strokes [P, 4] (m) on one map [H, W]."""

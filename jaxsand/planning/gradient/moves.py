@@ -102,12 +102,14 @@ def reordered(account: Account, start: Plans) -> Plans:
     plans, losses = start.strokes, start.losses
     while True:
         plan, n = plans[0], plans.shape[1]
+        if account.room(n) < 1:
+            return Plans(plans, losses)
         others = list(plan[swaps(n)])
         for k in range(n):
             turned = plan.copy()
             turned[k] = plan[k, [2, 3, 0, 1]]
             others.append(turned)
-        far = account.losses(np.stack(others))
+        far = account.varied(account.around(plan), np.stack(others))
         better = float(far.min()) < losses[0] * 0.999
         best = ranked(np.concatenate([plans, others]), np.concatenate([losses, far]), len(plans))
         plans, losses = best.strokes, best.losses
@@ -119,20 +121,19 @@ def replaced(account: Account, mark: Print, start: Plans, rng: np.random.Generat
     """Moves one stroke of the best plan to where the others leave most to do, as the first, the last, or in its place."""
     plans, losses = start.strokes, start.losses
     plan, n = plans[0], plans.shape[1]
+    if account.room(n) < 2:
+        return start
     dx = float(account.sand.scene.grid.spacing)
-    others = []
-    for k in range(n):
-        rest = np.delete(plan, k, axis=0)
-        if account.room(n) < 1 + 3 * _TRIED:
-            break
-        left = account.maps(rest[None])[0] if n > 1 else account.sand.start
+    near, others = account.around(plan), list[np.ndarray]()
+    for k, left in enumerate(account.left(near, np.stack([np.delete(plan, k, axis=0) for k in range(n)]))):
         if np.isnan(left).any():
             continue
+        rest = np.delete(plan, k, axis=0)
         new = account.sand.inside(guesses(mark, left, account.sand.target, 1, rng)[0][:_TRIED, 0] * dx)
         others += [np.insert(rest, place, stroke, axis=0) for stroke in new for place in {0, k, n - 1}]
     if not others:
         return start
-    far = account.losses(np.stack(others))
+    far = account.varied(near, np.stack(others))
     return ranked(np.concatenate([plans, others]), np.concatenate([losses, far]), len(plans))
 
 

@@ -2,11 +2,14 @@
 refined.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
+from jaxsand.planning.around import Around
 from jaxsand.planning.stroke_loss import SandLoss, pushed
 from jaxsand.scene.progress import Tell, quiet
 from jaxsand.scene.scene import Scene
@@ -19,6 +22,15 @@ class Proposes(Protocol):
 
     def propose(self, scene: Scene, goal: np.ndarray, current: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """For maps [B, H, W] (m), strokes [B, count, 4] (m), likeliest first, and the logarithms of their likelihoods."""
+
+
+class Pushed(Protocol):
+    """A plan that has been pushed, such as `Around`."""
+
+    calls: int
+
+    def varied(self, plans: np.ndarray) -> np.ndarray:
+        """The losses [P] of plans [P, N, 4] (m) that are like it."""
 
 
 @dataclass(frozen=True)
@@ -83,20 +95,20 @@ def look_ahead(policy: Proposes, sand: SandLoss, strokes: int, width: int = 8, t
         if losses[0] < least:
             plan, least = plans[0], losses[0]
     tell(f"putting {len(plan)} strokes right, {calls} pushes tried")
-    plan, tried = put_right(sand, plan, least)
-    return Ahead(plan, _losses(sand, plan), calls + tried + len(plan))
+    plan, tried = put_right(partial(Around, sand), sand.scene, plan, least)
+    return Ahead(plan, Around(sand, plan).losses, calls + tried + len(plan))
 
 
 def most_calls(strokes: int, width: int) -> int:
     """How often a plan of up to `strokes` strokes calls the simulator at most, by `look_ahead` or, of width 0, by the policy
     alone.
 
-    N strokes take N calls; to look ahead takes N width^2 for the beam and 2 N (8 N + 2) for `put_right` besides.
+    N strokes take N calls; to look ahead takes N width^2 for the beam and 8 N^2 + 14 N for `put_right` besides.
     """
-    return strokes + (strokes * width**2 + 2 * strokes * (8 * strokes + 2) if width else 0)
+    return strokes + (strokes * width**2 + 8 * strokes**2 + 14 * strokes if width else 0)
 
 
-def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray, int]:
+def put_right(push: Callable[[np.ndarray], Pushed], scene: Scene, plan: np.ndarray, loss: float) -> tuple[np.ndarray, int]:
     """Refines a plan: moves its end points a little, to a plan that ends at least as close to the goal.
 
     A network sees where a stroke belongs to a tenth of a cell; the simulator tells more. There are two rounds, with s = 1/4
@@ -109,27 +121,29 @@ def put_right(sand: SandLoss, plan: np.ndarray, loss: float) -> tuple[np.ndarray
     edge the moves are shorter, and the parabolas only approximate.
 
     Args:
-      sand: the loss, its start and its goal.
+      push: pushes a plan, to tell the losses of plans like it.
+      scene: grid and sand.
       plan: [N, 4] (m).
       loss: of the plan (m^2), finite.
 
     Returns:
-      The refined plan [N, 4] (m), and the calls of the simulator, 2 N (8 N + 2).
+      The refined plan [N, 4] (m), and the calls of the simulator, at most 8 N^2 + 14 N.
     """
     if not len(plan):
         return plan, 0
-    dx, (rows, columns) = float(sand.scene.grid.spacing), sand.scene.grid.shape
+    dx, (rows, columns) = float(scene.grid.spacing), scene.grid.shape
     low, high = 0.5 * dx, (np.array([columns, rows] * 2) - 0.5) * dx
     n, calls = len(plan), 0
     moves = np.concatenate([np.eye(4 * n), -np.eye(4 * n)]).reshape(-1, n, 4)
     for aside in _ASIDE:
+        near = push(plan)
         moved = np.clip(plan + aside * dx * moves, low, high)
-        far = sand(moved)
+        far = near.varied(moved)
         step = _downhill(loss, *np.split(far, 2)).reshape(n, 4)
         both = np.clip(plan + aside * dx * np.stack([step, step / 2]), low, high)
-        every, losses = np.concatenate([plan[None], moved, both]), np.concatenate([[loss], far, sand(both)])
-        calls += n * (len(every) - 1)
+        every, losses = np.concatenate([plan[None], moved, both]), np.concatenate([[loss], far, near.varied(both)])
         plan, loss = every[losses.argmin()], losses.min()
+        calls += near.calls
     return plan, calls
 
 
@@ -144,15 +158,6 @@ def _downhill(here: float, up: np.ndarray, down: np.ndarray) -> np.ndarray:
     least = least / (2 * np.where(curved, bend, 1))
     side = np.where(up < down, 1.0, -1.0) * (np.minimum(up, down) < here)
     return np.clip(np.where(curved, least, side), -1, 1)
-
-
-def _losses(sand: SandLoss, plan: np.ndarray) -> np.ndarray:
-    """The losses [N + 1] of the start and after each stroke."""
-    maps, losses = sand.start[None].astype(np.float32), [sand.loss_of(sand.start.astype(np.float32))]
-    for stroke in plan:
-        far, maps = sand.after(maps, stroke[None])
-        losses.append(float(far[0]))
-    return np.array(losses)
 
 
 def _different(far: np.ndarray, maps: np.ndarray, most: int) -> list[int]:
