@@ -58,11 +58,11 @@ def run(path, slow):
     return names
 
 
-LONG = ("environments.md", "landing-pad.md", "pit-and-heap.md", "sampling-trench.md", "tools.md")
+LONG = ("README.md", "environments.md", "landing-pad.md", "pit-and-heap.md", "sampling-trench.md", "tools.md")
 
 
 def marked(path):
-    """A page by its marks: those that compile many programs are for the wide tests."""
+    """A page by its marks: those that compile many programs are for the wide tests; `.ci/run` runs the README's, too."""
     return pytest.param(path, marks=pytest.mark.wide if path.name in LONG else ())
 
 

@@ -9,28 +9,33 @@ from jaxsand.planning.stroke_loss import sand_loss
 from jaxsand.scene.tools import Blade
 
 DEPTH = float(Blade().depth)
-E = letters("E")[0]  # four strokes
 
 
-def left(strokes):
-    return sand_loss(E.scene, E.start, E.goal).maps(np.asarray(strokes, np.float32)[None])[0]
+@pytest.fixture(scope="module")
+def letter():
+    """An E, of four strokes."""
+    return letters("E")[0]
 
 
-def test_the_goal_itself_is_right_and_strict_and_level_sand_is_not():
-    assert right(E.goal, E.goal, DEPTH)
-    assert strict(E.goal, E.start, E.goal, DEPTH)
-    assert not right(E.goal, E.start, DEPTH)
-    assert not strict(E.goal, E.start, E.start, DEPTH)
-    assert right(E.start, E.start, DEPTH)  # nothing was asked for, and nothing was dug
+def left(letter, strokes):
+    return sand_loss(letter.scene, letter.start, letter.goal).maps(np.asarray(strokes, np.float32)[None])[0]
+
+
+def test_the_goal_itself_is_right_and_strict_and_level_sand_is_not(letter):
+    assert right(letter.goal, letter.goal, DEPTH)
+    assert strict(letter.goal, letter.start, letter.goal, DEPTH)
+    assert not right(letter.goal, letter.start, DEPTH)
+    assert not strict(letter.goal, letter.start, letter.start, DEPTH)
+    assert right(letter.start, letter.start, DEPTH)  # nothing was asked for, and nothing was dug
 
 
 @pytest.mark.wide
-def test_one_stroke_less_or_another_one_is_wrong_and_a_small_shift_is_right_but_not_strict():
-    assert not right(E.goal, left(E.strokes[:-1]), DEPTH)
-    assert not right(E.goal, left([*E.strokes[:-1], [0.06, 0.06, 0.26, 0.26]]), DEPTH)
-    shifted = left(E.strokes + np.array([0.005, 0, 0.005, 0]))
-    assert right(E.goal, shifted, DEPTH)
-    assert not strict(E.goal, E.start, shifted, DEPTH)
+def test_one_stroke_less_or_another_one_is_wrong_and_a_small_shift_is_right_but_not_strict(letter):
+    assert not right(letter.goal, left(letter, letter.strokes[:-1]), DEPTH)
+    assert not right(letter.goal, left(letter, [*letter.strokes[:-1], [0.06, 0.06, 0.26, 0.26]]), DEPTH)
+    shifted = left(letter, letter.strokes + np.array([0.005, 0, 0.005, 0]))
+    assert right(letter.goal, shifted, DEPTH)
+    assert not strict(letter.goal, letter.start, shifted, DEPTH)
 
 
 def test_cells_count_within_one_cell_by_eight_neighbours():

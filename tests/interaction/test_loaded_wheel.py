@@ -17,7 +17,6 @@ SIZE = {"radius": 0.03, "width": 0.03, "slip_angle": 0.2}
 X = np.broadcast_to((np.arange(20) + 0.5) * DX, SHAPE)
 PATH = np.array([[0.05, 0.06], [0.11, 0.06], [0.14, 0.08]])
 LOAD, SLIP = 5.0, 0.2
-SINKAGE = float(js.forces.wheel_sinkage(js.forces.WONG_DRY_SAND, 0.03, 0.03, LOAD, SLIP))
 
 
 def loaded(load=LOAD, **more):
@@ -30,20 +29,28 @@ def rut(load, height, path=PATH):
     return js.SteppedPush().along(js.Scene(**(vars(loaded(load)) | {"window": js.Whole()})), height, path)[0]
 
 
-FIXED = js.make_scene(SHAPE, DX, ANGLE, tool=js.Wheel(**SIZE, sinkage=SINKAGE), window=js.Whole())
-at_heights = jax.jit(lambda height, path: js.SteppedPush().along(FIXED, height, path)[0].height)
+@pytest.fixture(scope="module")
+def sinkage():
+    return float(js.forces.wheel_sinkage(js.forces.WONG_DRY_SAND, 0.03, 0.03, LOAD, SLIP))
 
 
-def test_a_rut_is_that_of_the_solved_sinkage_below_the_ground():
+@pytest.fixture(scope="module")
+def at_heights(sinkage):
+    """What a wheel that stands so deep leaves along a path with heights."""
+    fixed = js.make_scene(SHAPE, DX, ANGLE, tool=js.Wheel(**SIZE, sinkage=sinkage), window=js.Whole())
+    return jax.jit(lambda height, path: js.SteppedPush().along(fixed, height, path)[0].height)
+
+
+def test_a_rut_is_that_of_the_solved_sinkage_below_the_ground(sinkage, at_heights):
     """On level ground and on a slope up from height 0, around a corner; and wherever height 0 is."""
     for slope in (0.0, 0.15):
         ground = slope * (X - PATH[0, 0])
-        heights = slope * (PATH[:, 0] - PATH[0, 0]) - SINKAGE
+        heights = slope * (PATH[:, 0] - PATH[0, 0]) - sinkage
         got = rut(LOAD, ground)
         assert int(got.outcome) == 0
         assert np.abs(got.height - at_heights(ground, np.column_stack([PATH, heights]))).max() < 1e-12
         assert np.abs(rut(LOAD, ground + 0.05).height - 0.05 - got.height).max() < 1e-12
-        assert (got.height - ground).min() < -0.5 * SINKAGE
+        assert (got.height - ground).min() < -0.5 * sinkage
         assert volume_error(ground, got.height) < 1e-12
 
 
@@ -88,11 +95,11 @@ def test_paths_with_heights_and_closed_forms_are_refused():
         js.step(loaded(), np.zeros(SHAPE), [0.05, 0.06, 0.11, 0.06], push=js.SplitPush())
 
 
-def test_grousers_give_the_slip():
+def test_grousers_give_the_slip(sinkage):
     driven = js.Wheel(0.03, 0.03, grousers=js.Grousers(spin=1.25), load=LOAD)
     from jaxsand.scene.tools import sunk
 
-    assert float(jax.jit(lambda wheel: sunk(wheel)[0].sinkage)(driven)) == pytest.approx(SINKAGE, rel=1e-12)
+    assert float(jax.jit(lambda wheel: sunk(wheel)[0].sinkage)(driven)) == pytest.approx(sinkage, rel=1e-12)
     assert len(jax.tree.leaves(js.Wheel())) == 4  # as of a wheel that knows of no loads
 
 

@@ -26,23 +26,31 @@ SHAPE = (14, 14)
 SCENE = js.make_scene(SHAPE, 0.01, tool=js.Blade())
 LEVEL = np.zeros(SHAPE, np.float32)
 STROKES = np.array([[0.03, 0.05, 0.11, 0.05], [0.03, 0.09, 0.11, 0.09]])
-GOAL = replay(SCENE, LEVEL, [s.reshape(2, 2) for s in STROKES])
-WANTED = as_goal(SCENE, GOAL)
 BUDGET = 200
 
 
 @pytest.fixture(scope="module")
-def found():
-    return js.plan_sand(SCENE, LEVEL, GOAL, strokes=2, budget=BUDGET)
+def goal():
+    return replay(SCENE, LEVEL, [s.reshape(2, 2) for s in STROKES])
 
 
-def test_a_plan_replayed_leaves_what_it_says(found):
+@pytest.fixture(scope="module")
+def wanted(goal):
+    return as_goal(SCENE, goal)
+
+
+@pytest.fixture(scope="module")
+def found(goal):
+    return js.plan_sand(SCENE, LEVEL, goal, strokes=2, budget=BUDGET)
+
+
+def test_a_plan_replayed_leaves_what_it_says(found, wanted):
     height = replay(SCENE, LEVEL, found.paths)
     np.testing.assert_array_equal(height, found.height)
-    assert float(distance(height, WANTED)) == found.after
+    assert float(distance(height, wanted)) == found.after
     rolled = js.rollout(SCENE, jnp.asarray(LEVEL), jnp.asarray(found.strokes, jnp.float32))
-    assert float(distance(np.asarray(rolled.height[-1]), WANTED)) == pytest.approx(found.after, rel=1e-3)
-    assert found.before == float(distance(LEVEL, WANTED))
+    assert float(distance(np.asarray(rolled.height[-1]), wanted)) == pytest.approx(found.after, rel=1e-3)
+    assert found.before == float(distance(LEVEL, wanted))
     assert 0 < len(found.paths) <= 2
     assert found.reason is None
 
@@ -57,16 +65,16 @@ def test_a_plan_gains_and_its_bounds_hold(found):
 
 
 @pytest.mark.wide
-def test_equal_seeds_give_equal_plans(found):
-    again = js.plan_sand(SCENE, LEVEL, GOAL, strokes=2, budget=BUDGET)
+def test_equal_seeds_give_equal_plans(found, goal):
+    again = js.plan_sand(SCENE, LEVEL, goal, strokes=2, budget=BUDGET)
     np.testing.assert_array_equal(again.strokes, found.strokes)
     assert again.effort == found.effort
-    other = js.plan_sand(SCENE, LEVEL, GOAL, strokes=2, budget=BUDGET, seed=1)
+    other = js.plan_sand(SCENE, LEVEL, goal, strokes=2, budget=BUDGET, seed=1)
     assert not np.array_equal(other.strokes, found.strokes)
 
 
 @pytest.mark.parametrize("budget", [1, 2, 3, 5, 7, 12, 40, 100, 300])
-def test_a_search_costs_no_more_than_its_budget(monkeypatch, budget):
+def test_a_search_costs_no_more_than_its_budget(monkeypatch, budget, wanted):
     """With sand that costs nothing: what is pushed is what is counted, and is within the budget, for strokes and legs."""
     pushes = {"full": 0, "rough": 0}
     dig = np.random.default_rng(0)
@@ -85,11 +93,11 @@ def test_a_search_costs_no_more_than_its_budget(monkeypatch, budget):
         rollouts, "settle_batch", lambda _, maps: SimpleNamespace(height=maps, outcome=np.zeros(len(maps), int))
     )
     monkeypatch.setattr(of_steps, "follow_padded", follow_padded)
-    hints = propose(SCENE, js.Lattice(), LEVEL, WANTED, 24, dig)
+    hints = propose(SCENE, js.Lattice(), LEVEL, wanted, 24, dig)
     for count in (1, 2, 6):
         for hinted in (hints, hints[:0]):
             pushes.update(full=0, rough=0)
-            job = Job(SCENE, LEVEL, WANTED, count, js.Lattice())
+            job = Job(SCENE, LEVEL, wanted, count, js.Lattice())
             found, effort = of_strokes.search_strokes(job, hinted, budget, np.random.default_rng(1))
             assert (effort.full, effort.rough) == (pushes["full"], pushes["rough"])
             assert effort.full + CHEAP * effort.rough <= budget + 1e-9
@@ -97,13 +105,13 @@ def test_a_search_costs_no_more_than_its_budget(monkeypatch, budget):
             assert effort.cost > min(0.6 * budget, budget - 1.5 * count)  # nor does it leave much of it
         for hint in (np.array([[1, 1], [1, 2], [1, 3], [2, 3]]), np.zeros((0, 2), int)):
             pushes.update(full=0, rough=0)
-            job = Job(SCENE, LEVEL, WANTED, count, js.Steps(2))
+            job = Job(SCENE, LEVEL, wanted, count, js.Steps(2))
             _, effort = of_steps.search_steps(job, hint, budget, np.random.default_rng(1))
             assert effort.full == pushes["full"] <= budget
 
 
-def test_at_the_goal_there_is_nothing_to_do():
-    done = js.plan_sand(SCENE, GOAL, GOAL, strokes=2, budget=BUDGET)
+def test_at_the_goal_there_is_nothing_to_do(goal):
+    done = js.plan_sand(SCENE, goal, goal, strokes=2, budget=BUDGET)
     assert (done.paths, done.before, done.after, done.reduction, done.effort) == ((), 0.0, 0.0, 0.0, Effort())
     assert done.strokes.shape == (0, 4)
     assert done.reason.startswith("the sand lies as the goal has it already")
@@ -186,22 +194,22 @@ def test_nodes_that_look_alike_are_one():
 
 
 @pytest.mark.wide
-def test_children_are_pushed_as_they_would_be_alone():
+def test_children_are_pushed_as_they_would_be_alone(goal):
     ways = np.concatenate([STROKES, STROKES[:, [2, 3, 0, 1]], STROKES / 2])
-    maps = pushed(SCENE, np.repeat(GOAL[None], len(ways), axis=0), ways)
+    maps = pushed(SCENE, np.repeat(goal[None], len(ways), axis=0), ways)
     for one, way in zip(maps, ways, strict=True):
-        np.testing.assert_allclose(one, js.step(SCENE, GOAL, way.astype(np.float32)).height, atol=2e-5)
-    rough = roughly_pushed(SCENE, np.repeat(GOAL[None], len(ways), axis=0), ways)
-    assert np.abs(rough - maps).sum() < 0.65 * np.abs(maps - GOAL).sum()  # here over trenches that are there already
+        np.testing.assert_allclose(one, js.step(SCENE, goal, way.astype(np.float32)).height, atol=2e-5)
+    rough = roughly_pushed(SCENE, np.repeat(goal[None], len(ways), axis=0), ways)
+    assert np.abs(rough - maps).sum() < 0.65 * np.abs(maps - goal).sum()  # here over trenches that are there already
     down, lifted = walked(SCENE, np.repeat(LEVEL[None], 2, axis=0), STROKES)
     np.testing.assert_allclose(lifted[0], js.step(SCENE, LEVEL, STROKES[0].astype(np.float32)).height, atol=2e-5)
     assert np.abs(down - lifted).max() > 1e-3
 
 
-def test_strokes_stay_on_the_map_and_within_their_length():
+def test_strokes_stay_on_the_map_and_within_their_length(wanted):
     rng = np.random.default_rng(0)
     actions = js.Lattice(pitch=2.0, shortest=3.0, longest=6.0)
-    ways = propose(SCENE, actions, LEVEL, WANTED, 50, rng)
+    ways = propose(SCENE, actions, LEVEL, wanted, 50, rng)
     assert ways.shape == (50, 4)
     np.testing.assert_allclose((ways / 0.01 - 1) % 2, 0, atol=1e-6)
     for strokes, least in ((ways, 0.03), (moved(SCENE, actions, ways, rng), 0)):
@@ -211,16 +219,16 @@ def test_strokes_stay_on_the_map_and_within_their_length():
 
 
 @pytest.mark.wide
-def test_the_binary_plan_and_the_rivals():
+def test_the_binary_plan_and_the_rivals(wanted):
     drawn = LEVEL.copy()
     drawn[4:6, 2:10], drawn[6:10, 8:10] = -0.0075, -0.0075
     (walk,) = binary_paths(SCENE, LEVEL, as_goal(SCENE, drawn), js.Steps(2))
     assert len(walk) == 6
     assert [b - a for a, b in straight_runs(walk)] in ([3, 2], [2, 3])
-    job = Job(SCENE, LEVEL, WANTED, 2, js.Lattice())
+    job = Job(SCENE, LEVEL, wanted, 2, js.Lattice())
     for rival in (binary, greedy, shooting):
         paths, effort = rival(job, 60, np.random.default_rng(0))
-        assert distance(replay(SCENE, LEVEL, paths), WANTED) <= distance(LEVEL, WANTED)
+        assert distance(replay(SCENE, LEVEL, paths), wanted) <= distance(LEVEL, wanted)
         assert effort.full > 0
     assert greedy(job, 60, np.random.default_rng(0))[1].cost <= 60
 
@@ -237,15 +245,15 @@ def test_the_binary_plan_and_the_rivals():
         ({"actions": js.Steps(cell=0)}, "actions.cell: got 0; give a whole number"),
         ({"actions": js.Steps(cell=8)}, "actions.cell: got 8 with margin 0 on .* smaller"),
         ({"scene": js.make_scene(SHAPE, 0.01)}, "scene.tool: got NoTool, which moves no sand; give"),
-        ({"goal": GOAL[:5]}, "goal: got shape .*; make the scene as large"),
-        ({"goal": GOAL * np.nan}, "goal: got NaN, free, in every cell"),
-        ({"height": GOAL * np.nan}, "height: got 196 cells that are not finite; fill"),
+        ({"goal": LEVEL[:5]}, "goal: got shape .*; make the scene as large"),
+        ({"goal": LEVEL * np.nan}, "goal: got NaN, free, in every cell"),
+        ({"height": LEVEL * np.nan}, "height: got 196 cells that are not finite; fill"),
         ({"height": LEVEL[0]}, "height: got shape"),
         ({"height": LEVEL + 0.1 * np.eye(14)}, "height: got a slope of .* settle it first"),
     ],
 )
-def test_bad_input(change, message):
-    given = {"scene": SCENE, "height": LEVEL, "goal": GOAL, **change}
+def test_bad_input(change, message, goal):
+    given = {"scene": SCENE, "height": LEVEL, "goal": goal, **change}
     with pytest.raises(ValueError, match=message):
         js.plan_sand(given.pop("scene"), given.pop("height"), given.pop("goal"), **given)
 

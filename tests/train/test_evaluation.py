@@ -13,61 +13,65 @@ from train.curves import curve, curves_figure, main
 from train.evaluation.glyphs import SETS, read_glyphs
 from train.evaluation.scores import evaluate, judged, page, picture, replayed
 
-GLYPHS = letters("LT")
+
+@pytest.fixture(scope="module")
+def glyphs():
+    return letters("LT")
 
 
 @dataclass(frozen=True)
 class Knows:
     """The strokes of the glyph that has this goal: each on the sand that those before it left, or the first again and again."""
 
+    glyphs: list
     forgets: bool = False
 
     def propose(self, scene, goal, current, count):
         out = []
         for wanted, height in zip(goal, current, strict=True):
-            strokes = next(g.strokes for g in GLYPHS if np.allclose(g.goal, wanted))
+            strokes = next(g.strokes for g in self.glyphs if np.allclose(g.goal, wanted))
             done = 0 if self.forgets or not height.any() else 1
             out.append(np.repeat(strokes[done : done + 1], count, 0))
         return np.array(out), np.zeros((len(goal), count))
 
 
 @pytest.mark.wide
-def test_a_policy_that_knows_the_strokes_gets_all_right():
-    report = evaluate(Knows(), GLYPHS, Stages())
+def test_a_policy_that_knows_the_strokes_gets_all_right(glyphs):
+    report = evaluate(Knows(glyphs), glyphs, Stages())
     assert {key: report[key] for key in ("right", "strict", "total", "stroke_right")} == {
         "right": 2,
         "strict": 2,
         "total": 2,
         "stroke_right": 2,
     }
-    for glyph in GLYPHS:
+    for glyph in glyphs:
         row = report["glyphs"][glyph.name]
         assert row["strokes_right"] == row["strokes"] == len(row["pushes"]) == 2
         assert row["iou"] > 0.99
         np.testing.assert_allclose(row["pushes"], glyph.strokes, atol=1e-6)
     json.dumps(report)
-    assert picture(GLYPHS, report, replayed(GLYPHS, report)).axes
-    odd = replace(GLYPHS[0], name=r"$\frac$")  # no formula, but what a user called it
-    of_odd = {"glyphs": {odd.name: report["glyphs"][GLYPHS[0].name]}}
+    assert picture(glyphs, report, replayed(glyphs, report)).axes
+    odd = replace(glyphs[0], name=r"$\frac$")  # no formula, but what a user called it
+    of_odd = {"glyphs": {odd.name: report["glyphs"][glyphs[0].name]}}
     drawn = picture([odd], of_odd, replayed([odd], of_odd))
     drawn.savefig(BytesIO())
     assert drawn.axes[0].get_title().startswith(odd.name)
 
 
 @pytest.mark.wide
-def test_one_stroke_again_and_again_is_one_right_stroke():
-    report = evaluate(Knows(forgets=True), GLYPHS, Stages())
+def test_one_stroke_again_and_again_is_one_right_stroke(glyphs):
+    report = evaluate(Knows(glyphs, forgets=True), glyphs, Stages())
     assert (report["right"], report["strict"], report["stroke_right"]) == (0, 0, 2)
     assert all(row["strokes_right"] == 1 for row in report["glyphs"].values())
 
 
-def test_no_push_changes_nothing():
-    row = judged(GLYPHS[0], np.zeros((0, 4)))
+def test_no_push_changes_nothing(glyphs):
+    row = judged(glyphs[0], np.zeros((0, 4)))
     assert (row["iou"], row["l2_reduction"], row["right"], row["pushes"]) == (0, 0, False, [])
 
 
-def test_a_page_shows_each_glyph_after_each_push_beside_its_goal():
-    glyph = GLYPHS[0]
+def test_a_page_shows_each_glyph_after_each_push_beside_its_goal(glyphs):
+    glyph = glyphs[0]
     row = judged(glyph, glyph.strokes)
     report = {"glyphs": {glyph.name: row}, "right": 1, "total": 1}
     shown = page([glyph], report, replayed([glyph], report))
