@@ -79,7 +79,9 @@ def test_mirrors_and_quarter_turns():
         assert held(SAND, other.load) == pytest.approx(held(SAND, out.load), rel=1e-4)
 
 
-@pytest.mark.parametrize(("count", "most"), [(30, 1e-8), pytest.param(3000, 2e-8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("count", "most"), [(30, 1e-8), pytest.param(3000, 2e-8, marks=[pytest.mark.slow, pytest.mark.compiled])]
+)
 def test_bed_and_bucket_keep_their_sand_in_float32(count, most):
     """Drift is 1.2e-8 after 3,000 actions: a column poured on a point is so tall that fine heights round as it settles."""
     rng = np.random.default_rng(1)
