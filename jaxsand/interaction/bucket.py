@@ -17,7 +17,7 @@ from jaxsand.autodiff.while_loop import Tree
 from jaxsand.interaction._path import Record, farthest, heading
 from jaxsand.interaction.blade_stepped import scoop_along
 from jaxsand.interaction.load import Load, added, as_load, inside_of, one_load, spilled
-from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured
+from jaxsand.interaction.pouring import check_amount, path_weights, point_weights, poured, rested
 from jaxsand.interaction.simulate import Path, Rules, Shaped, as_needed, as_path, checked, itself, lifted
 from jaxsand.interaction.stepped import SteppedPush
 from jaxsand.relaxation.ghost_cells import ExactSum
@@ -278,7 +278,7 @@ def _dumped(
         spread = path_weights(scene, path, jnp.where(sound, width, 0))
         weights = jnp.where(jnp.any(path[1:] != path[:-1]), spread, weights)
     after, account, missed = poured(scene, height, weights, asked, ExactSum(held.low, held.high))
-    settled = relax(scene, after, *rules)
+    settled = rested(scene, after, rules)
     outcome = settled.outcome | missed | said(Outcome.NOT_FINITE, ~sound)
     way, _ = heading(path[-2 if path.shape[0] > 1 else 0], path[-1], None)
     pose = Pose(path[-1, 0], path[-1, 1], way.cos, way.sin)

@@ -1,6 +1,6 @@
 """Sand that is put down or taken away: from a bucket, at a point, or over a footprint."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -153,8 +153,28 @@ def _settled(
     if bed.base is not None and sign < 0:
         where, there = _on_floor(bed, mark(scene, height)[0], where, amount)
     changed, _, missed = poured(scene, height, where, amount, ExactSum(jnp.zeros_like(amount), there), sign)
-    settled = relax(scene, changed, *rules)
+    settled = rested(scene, changed, rules)
     return replace(settled, outcome=settled.outcome | missed)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Poured:
+    """A map with new sand: `height` (m), in multiples of a quantum in which columns of any height add up exactly, and
+    `finer` (m), what lay below that, from 0 to a quantum.
+    """
+
+    height: Float[Array, "H W"]
+    finer: Float[Array, "H W"]
+
+
+def rested(scene: Scene, changed: Poured, rules: tuple[Scheme, Stop]) -> Settled:
+    """The settled map, with what is finer than the quantum of the tallest column set aside until that has flowed apart.
+
+    Otherwise heights beside a tall column are rounded to its digits, and the volume drifts with each that is poured.
+    """
+    settled = relax(scene, changed.height, *rules)
+    return replace(settled, height=settled.height + changed.finer)
 
 
 def _on_floor(bed: Bed, height: jax.Array, weights: jax.Array, amount: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -184,7 +204,7 @@ def _on_floor(bed: Bed, height: jax.Array, weights: jax.Array, amount: jax.Array
 
 def poured(
     scene: Scene, height: jax.Array, weights: jax.Array, amount: jax.Array, held: ExactSum, sign: jax.Array | float = 1.0
-) -> tuple[jax.Array, ExactSum, jax.Array]:
+) -> tuple[Poured, ExactSum, jax.Array]:
     """The map after a sum of heights `amount` (m) was put down (or, of sign -1, taken away) in proportion to weights [H, W].
 
     All of `held`, and no more, is put down if `amount` is as much or more.
@@ -225,7 +245,11 @@ def poured(
     put = put.ravel().at[jnp.argmax(share.ravel())].add(last).reshape(put.shape)
     missed = said(Outcome.NOT_POURED, (asked > there * (1 + 1e-6)) | ((whole <= 0) & (asked > 0)))
     missed = missed | said(Outcome.NOT_FINITE, ~sound)
-    return unmark(marked + sign * (put * size), height), ExactSum((account.low + last) * size, account.high * size), missed
+    finer = lax.stop_gradient(jnp.where(jnp.isfinite(marked), marked - jnp.floor(marked / size) * size, 0))
+    if bed.base is not None:
+        finer = jnp.where(marked - bed.base > size, finer, 0)
+    changed = Poured(unmark(marked - finer + sign * (put * size), height), finer)
+    return changed, ExactSum((account.low + last) * size, account.high * size), missed
 
 
 def point_weights(scene: Scene, point: Float[Array, "2"]) -> Float[Array, "H W"]:

@@ -83,7 +83,7 @@ def test_mirrors_and_quarter_turns():
     ("count", "most"), [(30, 1e-8), pytest.param(3000, 2e-8, marks=[pytest.mark.slow, pytest.mark.compiled])]
 )
 def test_bed_and_bucket_keep_their_sand_in_float32(count, most):
-    """Drift is 1.2e-8 after 3,000 actions: a column poured on a point is so tall that fine heights round as it settles."""
+    """Drift is a walk of roundings, 1e-8 after 3,000 actions; what is finer than a tall column's digits is kept aside."""
     rng = np.random.default_rng(1)
     scene = js.make_scene((N, N), DX, ANGLE, tool=js.Bucket(0.06, 0.04, 6e-5))
     none = jnp.zeros((), jnp.float32)
