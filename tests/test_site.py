@@ -6,8 +6,10 @@ import json
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import jax
+import numpy as np
 import pytest
 
 import jaxsand
@@ -19,7 +21,7 @@ NOTEBOOKS = ROOT / "notebooks"
 SITE = NOTEBOOKS / "site"
 README = ROOT / "README.md"
 PAGES = sorted(SITE.rglob("*.md"))
-BLOCK = re.compile(r"(<!-- slow -->\n)?^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"(?:<!-- (slow|torch) -->\n)?^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 pytestmark = pytest.mark.skipif(not SITE.exists(), reason="no site beside the tests")
 
@@ -29,9 +31,9 @@ def named(path):
 
 
 def blocks(path, language):
-    """The code blocks of a page in a language, each with whether it is slow."""
+    """The code blocks of a page in a language, each with whether it is slow; those that need torch are left out."""
     found = BLOCK.findall(path.read_text(encoding="utf-8"))
-    return [(bool(slow), code) for slow, kind, code in found if kind == language]
+    return [(mark == "slow", code) for mark, kind, code in found if kind == language and mark != "torch"]
 
 
 def runnable(slow):
@@ -73,6 +75,18 @@ def test_code_runs(path, tmp_path, monkeypatch):
     if path == README:
         assert names["batch"].shape == (16, 32, 32)
         assert float(abs(names["slope"]).max()) > 0
+
+
+def test_gradients_go_through_sand_inside_a_torch_model():
+    pytest.importorskip("torch")
+    (code,) = (code for mark, _, code in BLOCK.findall((SITE / "guides" / "files.md").read_text()) if mark == "torch")
+    names: dict[str, Any] = {}
+    with jax.enable_x64(False):
+        exec(compile(code, "files.md", "exec"), names)
+        stroke = jax.numpy.asarray(names["stroke"].detach().numpy())
+        slope = jax.grad(lambda s: (names["left"](jax.numpy.zeros((32, 32)), s) ** 2).sum())(stroke)
+    np.testing.assert_allclose(names["stroke"].grad, slope, rtol=1e-4)
+    assert abs(slope).max() > 0
 
 
 def test_drawings_are_understood():

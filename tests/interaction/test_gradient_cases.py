@@ -144,5 +144,6 @@ def check_smooth_points(case, least, most):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES[:6], ids=lambda case: case.name)
-def test_gradients_are_right_at_a_thousand_smooth_points(case):
-    check_smooth_points(case, 167, 4000)
+def test_gradients_are_right_at_smooth_points(case):
+    """At a thousand a tool by `jaxsand bench tools --points 1000`."""
+    check_smooth_points(case, 40, 1000)

@@ -270,10 +270,11 @@ def test_every_task_is_at_rest_and_has_something_to_do():
 
 
 @pytest.mark.slow
-def test_the_search_ends_a_fifth_closer_than_its_rivals_on_five_tasks():
-    rows = bench_sand(names=("crossing", "twin", "frame", "ridge", "stem"))
+def test_the_search_ends_a_fifth_closer_than_its_rivals():
+    """On two tasks of those of `jaxsand bench sand`."""
+    rows = bench_sand(names=("crossing", "stem"))
     closer = [row["closer"] for row in rows if row["method"] == "search"]
-    assert len(closer) == 5
+    assert len(closer) == 2
     assert min(closer) >= 0.2
     assert all(row["lower_bound"] <= row["after"] + 1e-9 for row in rows)
 
