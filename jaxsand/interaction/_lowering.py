@@ -15,6 +15,7 @@ from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at, truncate
 
+_THIN = 2.0**-10  # spacings: a traced blade may have no width, or no thickness
 Params: TypeAlias = tuple[blade.Shares, jax.Array, jax.Array, tuple[jax.Array, jax.Array] | None]
 
 
@@ -38,7 +39,8 @@ class Lower(LegStep[Way]):
         along, across = inner(along), inner(across)
         bottom = self.block.above(view, way.bottom / way.quantum)
         taken = truncate(cover * jnp.maximum(old - bottom, 0)) * at(holds)
-        s, n = along / (4 * way.half**2), across / (4 * way.side**2)
+        half, side = jnp.maximum(way.half, _THIN), jnp.maximum(way.side, _THIN)
+        s, n = along / (4 * half**2), across / (4 * side**2)
         p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
         size = jnp.maximum(jnp.abs(p), jnp.abs(q))
         x, y = along * pose.cos - across * pose.sin, along * pose.sin + across * pose.cos

@@ -41,6 +41,7 @@ _INTO, _DEEP = 0.78, 0.3  # 1 - exp(-_INTO - _DEEP (r / w)^3) of the berms has s
 _DEEPEST = 3.5  # r / w: beyond it, where a millionth stays outside, that share does not fall any more
 _INNER = 0.93  # how far it is strewn
 _BACK = 0.67  # of the sand under the blade when it is lowered: what leaves behind it and to its sides
+_THIN = 2.0**-10  # spacings: a traced blade may have no width, or no thickness
 _FAR = 50.0  # times the blade's thickness: no sand comes from farther back sooner than from there
 _ACROSS = (np.arange(16) - 7.5) / 8
 ROOM = 0.25  # with less room than this part of a profile's own, sand is held back
@@ -132,7 +133,7 @@ def _sweep_out(  # noqa: PLR0915
 ) -> tuple[jax.Array, ExactSum | None]:
     """One leg: takes up the sand in the way and sets it down."""
     dx, tool = site.bed.spacing, site.tool
-    half, side = jnp.asarray(tool.thickness) / 2, jnp.asarray(tool.width) / 2
+    half, side = (jnp.maximum(jnp.asarray(size) / 2, _THIN * dx) for size in (tool.thickness, tool.width))
     first_pose, under = pose, coverage(tool, pose, site.x, site.y, dx)
     _, pose, length = over_the_map(scene, site, pose, length)
     cover = coverage(tool, pose, site.x, site.y, dx, length)
@@ -163,7 +164,7 @@ def _sweep_out(  # noqa: PLR0915
         along = to_slice((end - place) / thick) - to_slice((-half - place) / thick)
         widths = 2 * side * along * on_line(scene, pose, place, side * jnp.asarray(_ACROSS, h.dtype), dx)
     width = jnp.maximum(jnp.sum(widths**2) / jnp.where(jnp.sum(widths) > 0, jnp.sum(widths), 1), dx)
-    reach = jnp.sqrt(tool.width * depth / mu)
+    reach = jnp.sqrt(2 * side * depth / mu)
 
     rim = None
     if site.bed.rim is not None:
@@ -211,7 +212,7 @@ def _sweep_out(  # noqa: PLR0915
     # The heap's balance, slice by slice.
     step = jnp.clip(place + thick / 2, half, end) - jnp.clip(place - thick / 2, half, end)
     lag = _LAG * (width / 2 + math.pi / 6 * reach * flanks) * (1 + _COARSE * dx / reach)
-    lag = lag / (1 + _SLIP * (reach / tool.width) ** 2)
+    lag = lag / (1 + _SLIP * (reach / (2 * side)) ** 2)
     share = -jnp.expm1(-flanks * step / lag)
     heaped, left_there = _heap_balance(ahead, share)
 
@@ -244,7 +245,8 @@ def _ring(
     where = Lean(behind.far, (1 - under) * jnp.clip((half - s) / dx + 0.5, 0, 1) * sand)
     start = unbounded(back * first / mu, jnp.asarray(tool.width), jnp.ones_like(mu), dx)
     room, _ = held(where, start, dx)
-    back = back * jnp.minimum(room * mu / jnp.where(first > 0, ROOM * back * first, 1), 1)
+    left = ROOM * back * first
+    back = back * jnp.minimum(room * mu / jnp.where(left > 0, left, 1), 1)
     reach = reach_of(back * first / mu, start, lambda r: held(where, r, dx), dx)
     shape = heights(where, reach, dx)
     total = jnp.sum(shape)

@@ -40,16 +40,16 @@ def moved(at, i, step):
 
 @pytest.mark.slow
 def test_forward_derivatives_in_sub_steps():
-    """Against central differences of 1e-8, to 1e-5 and 1e-6 (a gradient is some 10 long)."""
+    """Against central differences of 1e-9, to 1e-5 and 1e-6 (a gradient is some 10 long)."""
     f = partial(loss, STEPPED)
     forward = quick(lambda at, v: jax.jvp(f, at, v))
     zero = tuple(jnp.zeros_like(v) for v in point(0)[0])
     for seed in range(2):
         at, ways = point(seed)
         for i, (name, v) in enumerate(zip(NAMES, ways, strict=True)):
-            up, down = (float(forward(moved(at, i, sign * 1e-8 * v), zero)[0]) for sign in (1, -1))
+            up, down = (float(forward(moved(at, i, sign * 1e-9 * v), zero)[0]) for sign in (1, -1))
             slope = float(forward(at, moved(zero, i, v))[1])
-            assert slope == pytest.approx((up - down) / 2e-8, rel=1e-5, abs=1e-6), name
+            assert slope == pytest.approx((up - down) / 2e-9, rel=1e-5, abs=1e-6), name
 
 
 @pytest.mark.parametrize(
@@ -63,8 +63,8 @@ def test_gradients(push):
         at, ways = point(seed)
         g = value_and_grad(*at)[1]
         for i, (name, v) in enumerate(zip(NAMES, ways, strict=True)):
-            up, down = (float(value_and_grad(*moved(at, i, sign * 1e-8 * v))[0]) for sign in (1, -1))
-            assert float(jnp.sum(g[i] * v)) == pytest.approx((up - down) / 2e-8, rel=1e-5, abs=1e-6), name
+            up, down = (float(value_and_grad(*moved(at, i, sign * 1e-9 * v))[0]) for sign in (1, -1))
+            assert float(jnp.sum(g[i] * v)) == pytest.approx((up - down) / 2e-9, rel=1e-5, abs=1e-6), name
     ends = [(jnp.asarray(s), *at[1:]) for s in ([0.1, 0.06, 0.1, 0.06], [5.0, 5.0, 6.0, 6.0], [0.1, 0.06, 5.0, 0.06])]
     for slip, sinkage in ((0.0, 0.0122), (math.pi / 2, 0.0122), (0.3, 0.041), (0.0, 1e-6)):
         ends.append((*at[:3], jnp.asarray(sinkage, float), jnp.asarray(slip, float), at[5]))
