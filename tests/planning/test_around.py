@@ -66,6 +66,7 @@ def test_a_stroke_that_moves_is_pushed_with_those_that_see_it():
     crossed[0, 0] += 0.01
     assert pushes(far[None]) == 1
     assert pushes(crossed[None]) == 2
+    assert pushes(np.stack([far, far + 0.01, crossed])) == 1 + 4 + 2
 
 
 def test_strokes_are_left_out_and_added():
