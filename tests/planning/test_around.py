@@ -86,6 +86,20 @@ def test_a_plan_is_pushed_at_most_from_where_it_differs():
     np.testing.assert_array_equal(around.most(APART[None, :0]), [0])
 
 
+def test_it_is_told_which_strokes_may_see_what_a_stroke_changes():
+    np.testing.assert_array_equal(Around(Marked(), APART).touched, [2, 1, 1, 1])
+    assert Around(Marked(), APART[:0]).touched.shape == (0,)
+
+
+def test_a_plan_whose_maps_are_known_is_not_pushed():
+    sand, heights = Marked(), np.insert(APART, [2, 4], -0.01, axis=1)
+    maps = np.stack([all_pushed(APART[None, :k])[0] for k in range(5)])
+    around = Around(sand, APART, maps)
+    assert around.calls == sand.pushed == 0
+    np.testing.assert_array_equal(np.concatenate(list(around.along(APART[None]))), maps)
+    np.testing.assert_array_equal(Around(sand, heights, maps).touched, around.touched)
+
+
 def test_losses_are_those_after_each_stroke():
     around = Around(Marked(), APART)
     np.testing.assert_array_equal(around.losses, [all_pushed(APART[None, :k]).sum() for k in range(5)])

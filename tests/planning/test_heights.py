@@ -109,7 +109,8 @@ def test_a_search_with_heights_costs_no_more_than_its_budget(monkeypatch, budget
         pushes.append(len(ways))
         return SimpleNamespace(height=maps + dig.normal(0, 1e-3, maps.shape), outcome=np.zeros(len(maps), int))
 
-    monkeypatch.setattr(rollouts, "step_batch", step_batch)
+    for module in (rollouts, stroke_loss):
+        monkeypatch.setattr(module, "step_batch", step_batch)
     for strokes in (1, 2, 6):
         pushes.clear()
         job = Job(SCENE, LEVEL, WANTED, strokes, js.Rising())

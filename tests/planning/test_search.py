@@ -271,10 +271,10 @@ def test_every_task_is_at_rest_and_has_something_to_do():
 
 @pytest.mark.slow
 def test_the_search_ends_a_fifth_closer_than_its_rivals():
-    """On two tasks of those of `jaxsand bench sand`."""
-    rows = bench_sand(names=("crossing", "stem"))
+    """On one task of those of `jaxsand bench sand`."""
+    rows = bench_sand(names=("crossing",))
     closer = [row["closer"] for row in rows if row["method"] == "search"]
-    assert len(closer) == 2
+    assert len(closer) == 1
     assert min(closer) >= 0.2
     assert all(row["lower_bound"] <= row["after"] + 1e-9 for row in rows)
 

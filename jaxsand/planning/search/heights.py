@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaxsand.planning.around import Around
 from jaxsand.planning.gradient.account import Account
 from jaxsand.planning.gradient.moves import Plans, adam
 from jaxsand.planning.search.actions import Job, Path
@@ -136,27 +137,32 @@ def _varied(job: Job, known: PushedPlan, budget: float, rng: np.random.Generator
     """Varies the strokes of a plan one at a time, and adds some where there may be more; a variant is judged by what the
     whole plan leaves.
 
-    A variant of an early stroke costs all strokes after it, so late strokes are chosen more often, and more variants of
-    them are pushed. All costs at most `budget` full pushes.
+    A variant of a stroke costs the later ones that see what it changes, so strokes that few others see are chosen more
+    often, and more variants of them are pushed. All costs at most `budget` full pushes.
     """
-    effort = Effort()
+    effort, sand = Effort(), SandLoss(job.scene, job.height, job.goal)
+    near = Around(sand, known.plan, known.way)
     while (room := int(budget - effort.cost)) > 0:
         plan, way, count = known.plan, known.way, len(known.plan)
-        rest = np.maximum(count - np.arange(min(count + 1, job.strokes)), 1)
-        chance = (rest <= room) / np.sqrt(rest)
+        last = count < job.strokes
+        rest = np.concatenate([count - np.arange(count), [1] * last])  # what a variant may cost, and what it is likely to
+        cost = np.concatenate([near.touched, [1] * last])
+        chance = (rest <= room) / np.sqrt(cost)
         k = int(rng.choice(len(rest), p=chance / chance.sum()))
-        some = min(int(np.clip(_WORK / rest[k], _FEWEST, MOST_TRIED)), room // int(rest[k]))
+        some = min(int(np.clip(_WORK / cost[k], _FEWEST, MOST_TRIED)), room // int(rest[k]))
         if k == count:
             new = promising(job, way[-1], some, rng)
             tried = np.concatenate([np.repeat(plan[None], len(new), axis=0), new[:, None]], axis=1)
         else:
             tried = _hopeful(job, plan, k, way, some, rng)
-        maps = finish(job.scene, tried, k, way[k][None])
+        before = near.calls
+        maps = np.stack(list(near.along(tried)))
+        effort += Effort(full=max(near.calls - before, 1))  # where no variant differs, too, so that this ends
         ends = distance(maps[-1], job.goal)
-        effort += Effort(full=len(tried) * int(rest[k]))
         best = int(ends.argmin())
         if ends[best] < known.left:
-            known = PushedPlan(tried[best], np.concatenate([way[:k], maps[:, best]]), float(ends[best]))
+            known = PushedPlan(tried[best], maps[:, best], float(ends[best]))
+            near = Around(sand, known.plan, known.way)
     return known, effort
 
 
