@@ -171,14 +171,14 @@ def test_a_push_tells_the_angle_and_the_blade(push):
 
 @pytest.mark.slow
 def test_the_grids_error_of_a_push_is_told():
-    """A blade of six cells tells how far two grids put angle and depth off: by more than the noise does."""
+    """A blade of six cells tells how far two grids put angle and depth off: by more than the noise does, and less than half."""
     blade = js.Blade(0.06, 0.02, 0.02)
     pushed = np.asarray(js.step(sand(31, blade), LEVEL, STROKE, push=js.SwathPush()).height)
     trial, free = js.Trial(LEVEL, pushed + noise(1), STROKE), ("repose_angle", "depth")
     found = js.calibrate(sand(26, blade), trial, free=free, noise=NOISE, push=js.SwathPush())
     assert not found.verdict
     for name in free:
-        assert 0 < found.noise_errors[name] < found.grid_errors[name] < found.errors[name] < found.values[name] / 3
+        assert 0 < found.noise_errors[name] < found.grid_errors[name] < found.errors[name] < found.values[name] / 2
 
 
 def test_the_errors_are_the_cramer_rao_bound():
