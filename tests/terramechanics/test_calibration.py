@@ -171,7 +171,7 @@ def test_a_push_tells_the_angle_and_the_blade(push):
 
 @pytest.mark.slow
 def test_the_grids_error_of_a_push_is_told():
-    """A blade of six cells tells how far two grids put angle and depth off: by more than the noise does, and less than half."""
+    """A blade of six cells tells how far two grids put angle and depth off: more than the noise does, less than half."""
     blade = js.Blade(0.06, 0.02, 0.02)
     pushed = np.asarray(js.step(sand(31, blade), LEVEL, STROKE, push=js.SwathPush()).height)
     trial, free = js.Trial(LEVEL, pushed + noise(1), STROKE), ("repose_angle", "depth")
