@@ -115,7 +115,7 @@ AT_BEST = {"level": 0.0, "mound": 0.0304, "shallow trench": 0.003 * 32 / 12}  # 
 @pytest.mark.parametrize("name", GOALS_WITHOUT_A_BINARY_PLAN)
 def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypatch, name, method):
     """The method gets the goal, on sand at rest, and a blade that digs no deeper; what it finds is compared whole."""
-    from jaxsand.planning import methods, pipeline
+    from jaxsand.planning import methods, targets
 
     goal = np.zeros((12, 12))
     goal[4:8, 2:10] = GOALS_WITHOUT_A_BINARY_PLAN[name]
@@ -136,7 +136,7 @@ def test_no_binary_plan_is_asked_of_methods_that_use_none(here, capsys, monkeypa
 
     monkeypatch.setattr(methods, "plan_sand", plan_sand)
     monkeypatch.setattr(methods, "optimise_strokes", optimise_strokes)
-    monkeypatch.setattr(pipeline, "plan", plan)
+    monkeypatch.setattr(targets, "plan", plan)
     assert main(["shape", "goal.npy", "--surface", "rough.npy", "--method", method, "--out", "out", "--json"]) == 0
     out, err = capsys.readouterr()
     report = json.loads(out)
