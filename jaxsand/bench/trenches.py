@@ -50,10 +50,12 @@ def against_spacing(tell: Tell = quiet, spacings: int = 4) -> list[Row]:
     return rows
 
 
-def settling(tell: Tell = quiet, turns: int = 5) -> list[Row]:
-    """The paper's case of 160 x 160 cells: a trench before the sand flows (22.5 degrees, 15 mm, cells of 2 mm) is left to
-    settle. `error` is the largest distance from the limit of small steps over the largest change of height."""
-    spacing, cells = 2e-3, 160
+def settling(tell: Tell = quiet, turns: int = 5, spacing: float = 2e-3) -> list[Row]:
+    """The paper's case of 160 x 160 cells (of 2 mm): a trench before the sand flows (22.5 degrees, 15 mm) is left to settle.
+
+    `error` is the largest distance from the limit of small steps over the largest change of height.
+    """
+    cells = round(0.32 / spacing)
     wheel = Wheel(sinkage=0.015, slip_angle=math.radians(22.5))
     scene = make_scene((cells, cells), spacing, tool=wheel)
     stroke = np.array([0.06, 0.16, 0.26, 0.16])
@@ -71,7 +73,7 @@ def settling(tell: Tell = quiet, turns: int = 5) -> list[Row]:
     rows = []
     for name, scheme in _SCHEMES.items():
         for tolerance in (0.1, 0.03, 0.01, 1e-3):
-            tell(f"settling 160 x 160, {name}, tolerance {tolerance:g}")
+            tell(f"settling {cells} x {cells}, {name}, tolerance {tolerance:g}")
             stop = UntilStill(tolerance)
             took = timed(partial(settle, bed, start, scheme=scheme, stop=stop), turns)
             settled = took.result
