@@ -178,4 +178,4 @@ def spilled(scene: Scene, inside: Scene, pose: Pose, height: jax.Array, load: Lo
     weights = jnp.tensordot(amounts, jax.vmap(lambda point: point_weights(scene, point))(points), 1)
     whole = jnp.sum(amounts)
     after, account, missed = poured(scene, height, weights, whole, ExactSum(jnp.zeros_like(whole), whole))
-    return after.height + after.finer, added(replace(load, surface=surface), account, -1), missed
+    return after.whole, added(replace(load, surface=surface), account, -1), missed

@@ -11,7 +11,20 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxsand.interaction._path import heading
-from jaxsand.relaxation.ghost_cells import Bed, ExactSum, counted, largest, mark, prepare, quantum, total, truncate, unmark
+from jaxsand.relaxation.flux import worst_excess
+from jaxsand.relaxation.ghost_cells import (
+    Bed,
+    ExactSum,
+    counted,
+    halo,
+    largest,
+    mark,
+    prepare,
+    quantum,
+    total,
+    truncate,
+    unmark,
+)
 from jaxsand.relaxation.schemes import Scheme
 from jaxsand.relaxation.settling import Settled, relax
 from jaxsand.relaxation.stopping import Outcome, Stop, check_rule, said
@@ -160,21 +173,39 @@ def _settled(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Poured:
-    """A map with new sand: `height` (m), in multiples of a quantum in which columns of any height add up exactly, and
-    `finer` (m), what lay below that, from 0 to a quantum.
+    """A map to which sand was added.
+
+    Attributes:
+      height: the map (m), in multiples of the quantum in which columns as tall as the tallest add up exactly.
+      finer: what lay below that quantum (m), from 0 to a quantum.
+      quantum: the quantum (m).
     """
 
     height: Float[Array, "H W"]
     finer: Float[Array, "H W"]
+    quantum: Float[Array, ""]
+
+    @property
+    def whole(self) -> Float[Array, "H W"]:
+        """The map (m), rounded where it has to be."""
+        return self.height + self.finer
 
 
 def rested(scene: Scene, changed: Poured, rules: tuple[Scheme, Stop]) -> Settled:
     """The settled map, with what is finer than the quantum of the tallest column set aside until that has flowed apart.
 
-    Otherwise heights beside a tall column are rounded to its digits, and the volume drifts with each that is poured.
+    Otherwise heights beside a tall column are rounded to its digits, and the volume drifts with each that is poured. Where
+    a quantum is more than a small part of what counts as still, nothing is set aside.
     """
-    settled = relax(scene, changed.height, *rules)
-    return replace(settled, height=settled.height + changed.finer)
+    scheme, stop = rules
+    steeper = changed.quantum / scene.grid.spacing  # no slope becomes steeper by more, when it is added again
+    aside = steeper < stop.tolerance / 2
+    finer = jnp.where(aside, changed.finer, 0)
+    stricter = replace(stop, tolerance=stop.tolerance - jnp.where(aside, steeper, 0))
+    settled = relax(scene, changed.height + (changed.finer - finer), scheme, stricter)
+    height = settled.height + finer
+    residual = worst_excess(prepare(scene), halo(mark(scene, height)[0]))
+    return replace(settled, height=height, residual=lax.stop_gradient(residual))
 
 
 def _on_floor(bed: Bed, height: jax.Array, weights: jax.Array, amount: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -248,7 +279,7 @@ def poured(
     finer = lax.stop_gradient(jnp.where(jnp.isfinite(marked), marked - jnp.floor(marked / size) * size, 0))
     if bed.base is not None:
         finer = jnp.where(marked - bed.base > size, finer, 0)
-    changed = Poured(unmark(marked - finer + sign * (put * size), height), finer)
+    changed = Poured(unmark(marked - finer + sign * (put * size), height), finer, size)
     return changed, ExactSum((account.low + last) * size, account.high * size), missed
 
 

@@ -3,6 +3,10 @@
 A stroke changes the sand near it, and sees no more of it. So where a stroke of the known plan meets the sand that it met
 there, it leaves what it left there, and need not be pushed again: strokes before the first that differs, and later ones
 that lie elsewhere. Of 24 strokes over a whole map that is most of them.
+
+That holds to what settling leaves: each push lets the whole map settle to within a tolerance, so that far away, too, it may
+even out slopes that strokes before it have left a little above repose. On cells of 1 cm maps differed by 1.4e-5 m at most,
+and losses by 7e-5 of themselves.
 """
 
 import math
@@ -59,6 +63,8 @@ class Around:
 
     def most(self, plans: np.ndarray) -> np.ndarray:
         """How many strokes of each of the plans [P, K, n] are pushed at most, [P]: those from the first on that differs."""
+        if np.isnan(self.maps).any():  # equal to nothing, so that all are pushed
+            return np.full(len(plans), plans.shape[1])
         count = min(plans.shape[1], len(self.plan))
         alike = (plans[:, :count] == self.plan[:count]).all(2)
         return plans.shape[1] - np.logical_and.accumulate(alike, axis=1).sum(1)
@@ -68,7 +74,7 @@ class Around:
         return self._sand.costs(self.left(plans))
 
     def left(self, plans: np.ndarray) -> np.ndarray:
-        """The maps [P, H, W] that plans [P, K, n] (m) leave, as `SandLoss.maps` has them."""
+        """The maps [P, H, W] that plans [P, K, n] (m) leave, to within what settling leaves."""
         return deque(self.along(plans), maxlen=1)[0]
 
     def along(self, plans: np.ndarray) -> Iterator[np.ndarray]:
@@ -94,5 +100,4 @@ class Around:
 def _reach(scene: Scene) -> float:
     """How far (m) from its way the blade may cover sand."""
     blade = blade_of(scene)
-    ahead = float(blade.thickness) + float(blade.plates or 0)
-    return math.hypot(float(blade.width) / 2, ahead)
+    return math.hypot(float(blade.width) / 2, float(blade.thickness))

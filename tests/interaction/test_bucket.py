@@ -103,6 +103,17 @@ def test_bed_and_bucket_keep_their_sand_in_float32(count, most):
     assert 0 <= held(scene, load) <= 6e-5 * (1 + 1e-6)
 
 
+@pytest.mark.parametrize(("spacing", "volume"), [(0.01, 6e-5), (0.01, 1e-3), (0.05, 5.0)])
+def test_what_is_poured_is_as_still_as_it_says(spacing, volume):
+    """However tall the column was, 0.6 m, 10 m and 2 km, whose digits are a part of the tolerance, or more than that."""
+    scene, bed = js.make_scene((N, N), spacing, ANGLE), ROUGH.astype(np.float32) * np.float32(spacing / 0.01)
+    heap = js.deposit(scene, js.settle(scene, bed).height, [12.5 * spacing, 12.5 * spacing], volume)
+    again = js.settle(scene, heap.height)
+    assert int(heap.outcome) == int(again.outcome)
+    assert float(js.steepest_slope(scene, heap.height)) - math.tan(ANGLE) <= 1.001e-3 or int(heap.outcome)
+    assert int(heap.outcome) or int(again.sweeps) == 0
+
+
 def test_poured_on_a_point_it_is_a_cone():
     n, dx = 65, 0.005
     scene = js.make_scene((n, n), dx, ANGLE, "isotropic", tool=BUCKET)

@@ -100,6 +100,16 @@ def test_a_plan_whose_maps_are_known_is_not_pushed():
     np.testing.assert_array_equal(Around(sand, heights, maps).touched, around.touched)
 
 
+def test_beside_a_plan_that_came_to_no_end_all_is_pushed():
+    maps = np.stack([all_pushed(APART[None, :k])[0] for k in range(5)])
+    maps[2:] = np.nan
+    around = Around(Marked(), APART, maps)
+    swapped = APART[None, [0, 1, 3, 2]]
+    np.testing.assert_array_equal(around.most(swapped), [4])
+    around.left(swapped)
+    assert around.calls <= 4
+
+
 def test_losses_are_those_after_each_stroke():
     around = Around(Marked(), APART)
     np.testing.assert_array_equal(around.losses, [all_pushed(APART[None, :k]).sum() for k in range(5)])

@@ -93,7 +93,7 @@ def test_what_is_like_a_plan_is_told_as_if_it_were_pushed(letter, sand):
     moved = np.repeat(plan[None], 3, 0) + 0.002 * np.eye(3)[:, :, None]
     for plans in (np.stack([plan, turned, swapped, *moved]), np.stack([plan[1:], plan[:2]]), plan[None, [0, 1, 2, 0]]):
         before = near.calls
-        np.testing.assert_array_equal(near.left(plans), sand.maps(plans))
+        np.testing.assert_allclose(near.left(plans), sand.maps(plans), atol=1.5e-5)  # settling's tolerance, a cell long
         assert near.calls - before <= near.most(plans).sum() < plans.shape[0] * plans.shape[1]
     np.testing.assert_array_equal(
         near.losses, [sand.loss_of(letter.start), *(sand(plan[None, : k + 1])[0] for k in range(3))]

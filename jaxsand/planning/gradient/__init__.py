@@ -6,7 +6,7 @@ maps, strokes placed where the goal is not yet reached, and L-BFGS, until the go
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -170,6 +170,9 @@ def optimise_strokes(
     ]
     found = steps[-1].strokes
     height = sand.maps(found[None])[0]
+    if len(found):  # as it is pushed from the start, not beside another plan
+        last = replace(steps[-1], loss=sand.loss_of(height))
+        steps = [*(step for step in steps[:-1] if step.loss > last.loss), last]
     losses, calls = np.array([s.loss for s in steps]), np.array([s.calls for s in steps])
     reason = None if len(found) else why_no_strokes(scene, sand.start, sand.goal)
     return Optimised(found, losses, calls, account.calls, height, reason)
