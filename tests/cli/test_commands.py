@@ -252,8 +252,8 @@ def test_the_pushes_of_a_policy_count_those_before_the_gradients():
     assert left() == left("--lookahead", "2") == 0
     assert left("--refine") == 4000
     assert left("--refine", "--pushes", "100") == 97
-    assert left("--refine", "--pushes", "1000", "--lookahead", "2") == 1000 - (3 * 4 + 2 * 3 * 26 + 3)
-    with pytest.raises(ValueError, match="pushes: got 100, and the policy may take 171"):
+    assert left("--refine", "--pushes", "1000", "--lookahead", "2") == 1000 - (3 * 4 + 8 * 3**2 + 14 * 3 + 3)
+    with pytest.raises(ValueError, match="pushes: got 100, and the policy may take 129"):
         left("--refine", "--pushes", "100", "--lookahead", "2")
 
 

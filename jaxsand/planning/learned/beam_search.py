@@ -24,7 +24,7 @@ class Proposes(Protocol):
         """For maps [B, H, W] (m), strokes [B, count, 4] (m), likeliest first, and the logarithms of their likelihoods."""
 
 
-class Pushed(Protocol):
+class Nearby(Protocol):
     """A plan that has been pushed, such as `Around`."""
 
     calls: int
@@ -108,7 +108,7 @@ def most_calls(strokes: int, width: int) -> int:
     return strokes + (strokes * width**2 + 8 * strokes**2 + 14 * strokes if width else 0)
 
 
-def put_right(push: Callable[[np.ndarray], Pushed], scene: Scene, plan: np.ndarray, loss: float) -> tuple[np.ndarray, int]:
+def put_right(push: Callable[[np.ndarray], Nearby], scene: Scene, plan: np.ndarray, loss: float) -> tuple[np.ndarray, int]:
     """Refines a plan: moves its end points a little, to a plan that ends at least as close to the goal.
 
     A network sees where a stroke belongs to a tenth of a cell; the simulator tells more. There are two rounds, with s = 1/4
