@@ -79,7 +79,7 @@ def _corner(block: Block, frame: Frame, first: First) -> First:
 
 def _moved(x: jax.Array, by: jax.Array, axis: int) -> jax.Array:
     """The map from `by` rows or columns further on; 0 beyond its end."""
-    index = jnp.arange(x.shape[axis]) + by
+    index = jnp.arange(x.shape[axis], dtype=jnp.result_type(by)) + by
     index = jnp.where(index < 0, x.shape[axis], index)  # a negative index would count from the end
     return jnp.take(x, index, axis, mode="fill", fill_value=0)
 
