@@ -107,7 +107,11 @@ def strokes(names):
     assert all(found.losses[-1] < found.losses[0] / 4 for found in names["found"])
     assert max(names["left"].values()) <= 1
     degrees = names["degrees"]
-    assert all(int(fit.verdict) == 0 for fit in names["fits"].values())
+    assert {name: fit.verdict for name, fit in names["fits"].items()} == {
+        "a collapse": js.Verdict(0),
+        "a push": js.Verdict.GRID_UNKNOWN,
+        "both": js.Verdict(0),
+    }
     assert all(abs(value - 31) < 4 * error for value, error in degrees.values())
     assert degrees["both"][1] <= degrees["a collapse"][1] * 1.05 < degrees["a push"][1]
 

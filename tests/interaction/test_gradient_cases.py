@@ -110,7 +110,7 @@ def draw(rng, count):
     return tuple(np.asarray(v, np.float32) for v in inputs), solid
 
 
-def check_finite(kind, count, seed=0, batch=500):
+def check_finite(kind, count, seed=0, batch=250):
     """Fails with the numbers of cases by what their gradients are not finite in, and a few of them."""
     gradient, rng, wrong, numbers = gradients(kind), np.random.default_rng(seed), [], Counter()
     for k in range(-(-count // batch)):
@@ -128,7 +128,7 @@ def check_finite(kind, count, seed=0, batch=500):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_gradients_are_finite_in_extreme_cases(kind):
-    check_finite(kind, 500, seed=1)
+    check_finite(kind, 250, seed=1)
 
 
 def check_smooth_points(case, least, most):

@@ -78,13 +78,9 @@ def check_cones(rows):
 
 @pytest.mark.slow
 def test_the_exact_cones_angle_lies_within_two_stated_errors(monkeypatch):
+    """In all of 20 trials but one; `jaxsand bench calibrate` has a hundred."""
     monkeypatch.setattr("jaxsand.bench.calibration._seconds", lambda *_: 0.0)  # no clock is asked
-    check_cones(bench_cone(seeds=1))
-
-
-@pytest.mark.slow
-def test_the_exact_cones_angle_lies_within_two_stated_errors_in_95_of_100_trials():
-    check_cones(bench_cone(seeds=100))
+    check_cones(bench_cone(seeds=20))
 
 
 def ridge(degrees, half, height):
