@@ -240,6 +240,7 @@ def test_an_isotropic_pile_converges_to_the_cone():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_isotropic_pile_on_a_slope():
     errors = [piles.on_a_slope(33, 640), piles.on_a_slope(65, 2560)]
     assert errors[1] < 0.06
