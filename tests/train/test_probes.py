@@ -16,6 +16,8 @@ def prober(question, **options):
         task=Probing(Probe(question, Line())),
         sight=Flat((32, 32)),
         strategy=Own(),
+        exchange=0.0,
+        discount=0.9,
         actor_rate=2e-3,
         critic_rate=5e-3,
         follow=0.05,

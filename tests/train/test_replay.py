@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from train.replay.buffer import Buffer
-from train.replay.her import Final, Future, Own, Steps, last_steps, mixed, relabel
+from train.replay.her import Final, Future, Own, Steps, exchanged, last_steps, mixed, relabel
 
 ENDED = np.array([False, False, True, False, True, False, False])  # episodes 0-2, 3-4, and 5-6, which goes on
 LAST = np.array([2, 2, 2, 4, 4, 6, 6])
@@ -69,8 +69,25 @@ def test_one_step_in_one_and_copies_keeps_its_goal_reward_and_end(strategy, shar
     assert np.all(np.asarray(new.reward)[~own] == 0.5)
 
 
-def test_the_neutral_strategy_computes_nothing():
-    assert not jax.make_jaxpr(lambda key, steps: mixed(key, steps, Own(), judge))(jax.random.key(0), row()).eqns
+def test_a_share_has_the_goal_of_the_step_before_it_and_is_judged_by_it():
+    steps = relabel(jax.random.key(0), row(), Final(), judge)
+    keys = jax.random.split(jax.random.key(3), 2000)
+    new = jax.vmap(lambda key: exchanged(key, steps, 0.25, judge))(keys)
+    goal, before = np.asarray(new.after["goal"]), np.roll(LAST + 1.0, 1)
+    swapped = (goal == before) & (before != LAST + 1)
+    assert abs(swapped[:, [0, 3, 5]].mean() - 0.25) < 0.02  # elsewhere the step before has the same goal
+    np.testing.assert_array_equal(goal[~swapped], np.broadcast_to(LAST + 1, goal.shape)[~swapped])
+    np.testing.assert_array_equal(np.asarray(new.observation["goal"]), goal)
+    place = np.asarray(row().observation["current"])
+    reward, end = judge(place, place + 0.5, goal)
+    np.testing.assert_array_equal(np.asarray(new.reward), reward)
+    np.testing.assert_array_equal(np.asarray(new.terminated), end)
+    np.testing.assert_array_equal(np.asarray(new.action), np.broadcast_to(row().action, goal.shape))
+
+
+def test_what_is_neutral_computes_nothing():
+    for neutral in (lambda key, steps: mixed(key, steps, Own(), judge), lambda key, steps: exchanged(key, steps, 0.0, judge)):
+        assert not jax.make_jaxpr(neutral)(jax.random.key(0), row()).eqns
 
 
 def test_goals_may_be_maps():

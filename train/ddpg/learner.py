@@ -8,7 +8,8 @@ copies of the critic Q and the actor pi, and o' the observation after o, gradien
 
 with pi = tanh(raw) in R^A. A time limit is no end: only `terminated` cuts the values off. No value can exceed `most`, a
 bound that the task knows. Without it values diverge; the original implementation of HER clips them for the same reason.
-Hindsight is in `train.replay.her`.
+By default the discount is 0: the reward of a stroke tells what is gained at once, an episode's rewards sum up to all that it
+gains, and what later strokes may mend would hide how good this one is. Hindsight is in `train.replay.her`.
 """
 
 import math
@@ -26,7 +27,7 @@ from train.ddpg.acting import Acts
 from train.ddpg.networks import Actor, Critic, Flat, Maps, Sight
 from train.ddpg.tasks import Strokes, Task
 from train.replay.buffer import Buffer
-from train.replay.her import Future, Observation, Steps, Strategy, mixed
+from train.replay.her import Future, Observation, Steps, Strategy, exchanged, mixed
 
 _REMEMBERED = jnp.float16  # observations: maps in units of the blade's depth
 
@@ -64,13 +65,15 @@ class Ddpg:
     """The learner. A chunk is `steps` steps in each of `envs` environments, then `updates` updates of `batch` steps each.
 
     In the first `warm` chunks all actions are uniform. Later a share `random` of them is, and the others are the actor's
-    plus normal noise of standard deviation `noise`. The buffer holds `capacity` rows of `steps` steps.
+    plus normal noise of standard deviation `noise`. The buffer holds `capacity` rows of `steps` steps. A step that is drawn has
+    its own goal or one in hindsight (`strategy`), and a share `exchange` of them then the goal of another.
     """
 
     task: Task = field(default_factory=Strokes)
     sight: Sight = field(default_factory=Maps)
     strategy: Strategy = field(default_factory=Future)
-    discount: float = 0.9
+    exchange: float = 0.5
+    discount: float = 0.0
     actor_rate: float = 3e-4
     critic_rate: float = 1e-3
     follow: float = 0.01  # how far slow copies go to what they follow, at each update
@@ -192,11 +195,12 @@ def practise(learner: Ddpg, params: StrokeParams | None, state: Practice) -> tup
 
 def update(learner: Ddpg, agent: Agent, some: Steps) -> tuple[Agent, dict[str, jax.Array]]:
     """Updates both networks and their target copies once, from steps [B]."""
-    next_action, _ = _act(learner, agent.slow_actor, some.after)
-    ahead = _value(learner, agent.slow_critic, some.after, next_action)
-    ahead = jnp.minimum(ahead, learner.task.most(some.after))
-    target = some.reward + learner.discount * jnp.where(some.terminated, 0, ahead)
-    chex.assert_equal_shape([some.reward, some.terminated, ahead, target])  # [B]: a [B, 1] would broadcast to [B, B]
+    target = some.reward
+    if learner.discount:
+        next_action, _ = _act(learner, agent.slow_actor, some.after)
+        ahead = jnp.minimum(_value(learner, agent.slow_critic, some.after, next_action), learner.task.most(some.after))
+        target += learner.discount * jnp.where(some.terminated, 0, ahead)
+    chex.assert_equal_shape([some.reward, some.terminated, target])  # [B]: a [B, 1] would broadcast to [B, B]
 
     def critic_loss(critic: optax.Params) -> jax.Array:
         return jnp.mean((target - _value(learner, critic, some.observation, some.action)) ** 2)
@@ -258,7 +262,7 @@ def _improve(learner: Ddpg, agent: Agent, memory: Any, key: jax.Array) -> tuple[
 
 
 def _drawn(learner: Ddpg, key: jax.Array, rows: Steps) -> Steps:
-    """One step of each row [B, T, ...], with its own goal or one in hindsight."""
+    """One step of each row [B, T, ...], with its own goal, one in hindsight, or that of another step."""
     rows = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == _REMEMBERED else x, rows)
 
     def one(key: jax.Array, row: Steps) -> Steps:
@@ -266,7 +270,9 @@ def _drawn(learner: Ddpg, key: jax.Array, rows: Steps) -> Steps:
         at = jax.random.randint(which, (), 0, learner.steps)
         return jax.tree.map(lambda x: x[at], mixed(relabel, row, learner.strategy, learner.task.judge))
 
-    return jax.vmap(one)(jax.random.split(key, learner.batch), rows)
+    key, exchange = jax.random.split(key)
+    some = jax.vmap(one)(jax.random.split(key, learner.batch), rows)
+    return exchanged(exchange, some, learner.exchange, learner.task.judge)
 
 
 def _act(learner: Ddpg, actor: optax.Params, observation: Observation) -> tuple[jax.Array, jax.Array]:

@@ -1,11 +1,11 @@
 """Hindsight experience replay: a step is learned from again as if the result of its episode had been the goal.
 
-Andrychowicz et al. 2017 (arXiv:1707.01495), strategies "final" and "future". It only needs observations that are
-dictionaries with a `goal` and, of the same kind, the `current` state of what the goal is about.
+Andrychowicz et al. 2017 (arXiv:1707.01495), strategies "final" and "future"; `exchanged` is akin to their "random". It only
+needs observations that are dictionaries with a `goal` and, of the same kind, the `current` state of what the goal is about.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -115,6 +115,26 @@ def mixed(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> Ste
     choose, draw = jax.random.split(key)
     keeps = jax.random.uniform(choose, steps.ended.shape) * (1 + strategy.copies) < 1
     return chosen(keeps, steps, relabel(draw, steps, strategy, judge))
+
+
+def exchanged(key: jax.Array, steps: Steps, share: float, judge: Judge) -> Steps:
+    """The same steps [B], of which a share, chosen at random, has the goal of the step before it in place of its own.
+
+    Hindsight alone shows to every goal in it the very action that reached it. A critic then need not look at the action: it
+    can tell by the goal. Where goals are exchanged it sees the same goals with actions that miss them.
+    """
+    if not share:
+        return steps
+    goal = jax.tree.map(lambda x: jnp.roll(x, 1, 0), steps.after["goal"])
+    reward, terminated = jax.vmap(judge)(steps.observation["current"], steps.after["current"], goal)
+    others = replace(
+        steps,
+        observation=steps.observation | {"goal": goal},
+        reward=reward.astype(steps.reward.dtype),
+        terminated=terminated,
+        after=steps.after | {"goal": goal},
+    )
+    return chosen(jax.random.uniform(key, reward.shape) < share, others, steps)
 
 
 def chosen(which: jax.Array, one: Steps, other: Steps) -> Steps:
