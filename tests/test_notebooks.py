@@ -120,7 +120,7 @@ CHECKS = {"settling": settling, "planning": planning, "wheel": wheel, "strokes":
 
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")  # plt.show() where there is a display
-@pytest.mark.parametrize("notebook", [case(path, pytest.mark.slow) for path in NOTEBOOKS] or [NONE])
+@pytest.mark.parametrize("notebook", [case(path, pytest.mark.pages) for path in NOTEBOOKS] or [NONE])
 def test_a_notebook_runs_and_says_what_is_so(notebook):
     cells = sources(notebook)
     assert sum(f"{source}\n".count(FULL) for source in cells.values()) == 1

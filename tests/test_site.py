@@ -97,7 +97,7 @@ def test_drawings_are_understood():
     assert shown
 
 
-@pytest.mark.slow
+@pytest.mark.pages
 @pytest.mark.parametrize("path", runnable(slow=True), ids=named)
 def test_slow_code_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

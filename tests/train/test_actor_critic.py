@@ -290,10 +290,10 @@ def test_it_finds_the_known_values_of_a_probe_on_maps():
 
 @pytest.mark.slow
 def test_a_small_network_learns_on_sand():
-    learner = ActorCritic(plans=16, updates=16, batch=16, capacity=2048, widths=(16, 16, 16), blocks=(1, 1, 1))
+    learner = ActorCritic(plans=8, updates=24, batch=16, capacity=2048, widths=(16, 16, 16), blocks=(1, 1, 1))
     state = learner.init(0)
     first = learner.validate(state)
-    for _ in range(12):
+    for _ in range(8):
         state, _ = learner.advance(state)
     last = learner.validate(state)
     assert set(last) == {"score", "right", "strokes", "iou"}

@@ -246,7 +246,7 @@ def test_small_maps_are_learned_and_a_beam_does_no_worse(learner):
     pool = shape_pool(Shapes(), jax.random.key(5), 64, (3, 3), jnp.zeros((0, 3, 3), bool))
     few, state = fewest(pool), learner.init(1)
     before = np.mean(walks(learner.policy(state), pool) == few)
-    for _ in range(160):
+    for _ in range(240):
         state, _ = learner.advance(state)
     after = walks(learner.policy(state), pool)
     assert before < 0.7
