@@ -86,7 +86,10 @@ def test_a_share_has_the_goal_of_the_step_before_it_and_is_judged_by_it():
 
 
 def test_what_is_neutral_computes_nothing():
-    for neutral in (lambda key, steps: mixed(key, steps, Own(), judge), lambda key, steps: exchanged(key, steps, 0.0, judge)):
+    for neutral in (
+        lambda key, steps: mixed(key, steps, Own(), judge),
+        lambda key, steps: exchanged(key, steps, 0.0, judge),
+    ):
         assert not jax.make_jaxpr(neutral)(jax.random.key(0), row()).eqns
 
 

@@ -65,8 +65,8 @@ class Ddpg:
     """The learner. A chunk is `steps` steps in each of `envs` environments, then `updates` updates of `batch` steps each.
 
     In the first `warm` chunks all actions are uniform. Later a share `random` of them is, and the others are the actor's
-    plus normal noise of standard deviation `noise`. The buffer holds `capacity` rows of `steps` steps. A step that is drawn has
-    its own goal or one in hindsight (`strategy`), and a share `exchange` of them then the goal of another.
+    plus normal noise of standard deviation `noise`. The buffer holds `capacity` rows of `steps` steps. A step that is drawn
+    has its own goal or one in hindsight (`strategy`), and a share `exchange` of them then the goal of another.
     """
 
     task: Task = field(default_factory=Strokes)
