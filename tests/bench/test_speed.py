@@ -83,9 +83,12 @@ def test_runs_are_kept_and_compared_with_those_of_the_same_machine(tmp_path):
 
 
 @pytest.mark.slow
-def test_all_jobs_run():
-    jax.clear_caches()  # earlier tests of this process may have pushed alike
+def test_jobs_run_and_those_that_compile_say_so(monkeypatch):
+    """Of all jobs two; CI runs the whole bench."""
+    few = {name: job for name, job in speed.jobs().items() if name in ("settle 512 maps", "plan a letter")}
+    monkeypatch.setattr(speed, "jobs", lambda: few)
+    jax.clear_caches()  # earlier tests of this process may have settled alike
     rows = bench_speed(rounds=1)
-    assert {row["name"] for row in rows} == set(speed.jobs())
+    assert {row["name"] for row in rows} == set(few)
     assert all(row["ratio"] > 0 for row in rows)
     assert [row["name"] for row in rows if row["compile_ratio"] is None] == ["plan a letter"]

@@ -33,7 +33,6 @@ class Kind:
 KINDS = [
     Kind("blade, 8"),
     Kind("blade, isotropic, draining", "isotropic", draining=True),
-    Kind("blade, 4, draining", 4, draining=True),
     Kind("blade, 8, window", window=js.Window((8, 8))),
     Kind("blade in closed form", push=js.SwathPush(), scheme=js.Relaxation()),
     Kind("wheel", 4, tool="wheel"),

@@ -123,14 +123,14 @@ def test_a_probe_has_no_goals_to_learn_from_in_hindsight():
         learner.advance(learner.init(0))
 
 
-def test_the_judge_gives_the_environment_s_reward_for_any_goal():
+def test_the_judge_rewards_what_is_gone_of_the_squared_distance_of_any_goal():
     env, params = MultiStroke(), StrokeParams(usual_scene(), LevelGoals(jnp.zeros((1, 32, 32), jnp.float32)))
     goal, before, after = 0.005 * jax.random.normal(jax.random.key(0), (3, 32, 32), jnp.float32)
     states = [StrokeState(goal, x, jnp.int32(0)) for x in (before, after)]
     far = [float(env.distance(state, params)) for state in states]
     seen = [env.observe(state, params) for state in states]
     reward, end = Strokes().judge(seen[0]["current"], seen[1]["current"], seen[0]["goal"])
-    assert float(reward) == pytest.approx(far[0] - far[1], rel=1e-4)
+    assert float(reward) == pytest.approx((far[0] ** 2 - far[1] ** 2) / 5, rel=1e-4)
     assert not end
 
 
@@ -225,7 +225,7 @@ def test_without_others_goals_the_critic_does_not_look_at_the_action(exchange, l
     """By hindsight alone it values strokes as high on goals that they miss as on those they made; 5 apart they should be."""
     learner = Ddpg(task=Strokes(count=1, goals=256, trials=32), steps=1, exchange=exchange, updates=32)
     state = learner.init(0)
-    for _ in range(16):
+    for _ in range(8):
         state, _ = learner.advance(state)
     env, params = learner.world()
     actions = jax.random.uniform(jax.random.key(1), (32, 4), jnp.float32, -1, 1)

@@ -94,12 +94,13 @@ class Ddpg:
 
         What the paper does not say is taken from the original implementation of HER (OpenAI Baselines, Plappert et al. 2018,
         arXiv:1802.09464): three fully connected layers of 256, both rates 1e-3, target copies that follow by 5%, batches of
-        256, four goals in hindsight to one, 30% random actions, noise of 0.2, and a discount of 0.98.
-        Assumed: episodes of three strokes towards what three random strokes make of level sand; the reward L_t - L_{t+1};
-        one update an episode, where that implementation makes 20, so that it ends in minutes.
+        256, four goals in hindsight to one and none exchanged, 30% random actions, noise of 0.2, and a discount of 0.98.
+        Assumed: episodes of three strokes towards what three random strokes make of level sand; the reward L_t - L_{t+1},
+        with L the squared distance; one update an episode, where that implementation makes 20, so that it ends in minutes.
         """
         return cls(
             sight=Flat((256, 256, 256)),
+            exchange=0.0,
             discount=0.98,
             actor_rate=1e-3,
             critic_rate=1e-3,
@@ -244,6 +245,7 @@ def _step(
     keys = jax.random.split(world_key, learner.envs)
     after, world, reward, terminated, truncated, info = jax.vmap(env.step, (0, 0, 0, None))(keys, world, action, params)
     last, done = info["final_observation"], terminated | truncated
+    reward = learner.task.reward(observation, last, reward)
     return after, world, Steps(_remembered(observation), action, reward, terminated, _remembered(last), done)
 
 

@@ -17,10 +17,12 @@ from jaxsand.planning.stroke_loss import pushed
 from jaxsand.scene.tools import Blade
 from train.ddpg.acting import Acts
 from train.evaluation.probes import Probe
+from train.replay.her import Observation
 
 _PRACTICE, _SET_APART = 2_000_029, 1_000_003  # seeds of goals
 _ENV = MultiStroke()
 _SHORTEST = 0.15  # stroke of a goal, of the glyphs' square
+_UNIT = 5.0  # of rewards: squared depths over cells
 
 
 @dataclass(frozen=True)
@@ -39,15 +41,23 @@ class Strokes:
         return _ENV, _goals(self.count, self.goals, _PRACTICE)
 
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The reward for any goal, from maps [H, W] in units of the blade's depth, and False: no goal ends an episode."""
-        return metrics.l2(goal, before) - metrics.l2(goal, after), jnp.zeros((), bool)
+        """The reward for any goal, from maps [..., H, W] in units of the blade's depth, and False: no goal ends an episode.
+
+        It is what a stroke takes off the squared distance, L_t - L_{t+1} with L = |g - h|^2 / 5. Strokes that lie apart then
+        gain what each would gain alone, which the distance itself, the environment's reward, does not say.
+        """
+        return _far(goal, before) - _far(goal, after), jnp.zeros(before.shape[:-2], bool)
+
+    def reward(self, observation: Observation, after: Observation, given: jax.Array) -> jax.Array:
+        """The rewards [B] of steps, to which the environment gave others."""
+        return self.judge(observation["current"], after["current"], observation["goal"])[0]
 
     def most(self, observation: dict[str, jax.Array]) -> jax.Array:
         """An upper bound [B] of every value: with rewards L_t - L_{t+1}, L >= 0 and a discount g <= 1,
 
         sum_t g^t (L_t - L_{t+1}) = L_0 - (1 - g) sum_t g^t L_{t+1} <= L_0.
         """
-        return metrics.l2(observation["goal"], observation["current"])
+        return _far(observation["goal"], observation["current"])
 
     def validate(self, acts: Acts) -> dict[str, float]:
         """Judges a policy on goals set apart.
@@ -78,6 +88,10 @@ class Probing:
         """No reward and no end, since a probe has no goals."""
         return jnp.zeros(()), jnp.zeros((), bool)
 
+    def reward(self, observation: Observation, after: Observation, given: jax.Array) -> jax.Array:
+        """The rewards [B] that the environment gave."""
+        return given
+
     def most(self, observation: jax.Array) -> jax.Array:
         """No bound, [B]."""
         return jnp.full(len(observation), jnp.inf, observation.dtype)
@@ -92,6 +106,11 @@ class Probing:
 
 
 Task = Strokes | Probing
+
+
+def _far(goal: jax.Array, height: jax.Array) -> jax.Array:
+    """The squared distance [...] of maps [..., H, W] in units of the blade's depth, divided by 5."""
+    return jnp.sum((goal - height) ** 2, (-2, -1)) / _UNIT
 
 
 @cache
