@@ -268,7 +268,9 @@ def share_beyond(square: jax.Array, m: jax.Array) -> jax.Array:
     and another that it is not, the share must still be about 0: the length that is divided by is never below m.
     """
     least = m * m
-    size = jnp.sqrt(jnp.where(square > least, square, least + jnp.finfo(square.dtype).tiny))
+    size = jnp.sqrt(
+        jnp.where(square > least, square, jnp.where(least > 0, least, 1))
+    )  # 1: a derivative divides by its square
     return jnp.where(square > least, 1 - m / size, 0)
 
 
@@ -322,6 +324,7 @@ def _gradients(bed: Bed, x: jax.Array, y: jax.Array) -> Iterator[tuple[jax.Array
             if mu.ndim:  # the mean of its two links, or the one there is
                 mx, my = _west_east(hx)[i], _south_north(hy)[j]
                 m = (jnp.where(jnp.isnan(mx), my, mx) + jnp.where(jnp.isnan(my), mx, my)) / 2
+                m = jnp.where(jnp.isnan(m), 1, m)  # neither: no sand slides, whatever it is
             else:
                 m = mu
             yield _west_east(x)[i], _south_north(y)[j], m

@@ -121,15 +121,16 @@ def test_vmap_over_materials():
     assert np.all(np.abs(np.array(slopes) - np.tan(angles)) < 2e-3)
 
 
-def test_the_gradient_by_a_map_of_angles_is_right():
+@pytest.mark.parametrize("neighbours", [8, "isotropic"])
+def test_the_gradient_by_a_map_of_angles_is_right(neighbours):
     h, weights = rough((9, 10), "float64", scale=0.03), rough((9, 10), "float64", seed=1)
 
     def loss(angles):
-        return jnp.sum(weights * js.settle(js.make_scene(h.shape, DX, angles), h, stop=js.Sweeps(8)).height)
+        return jnp.sum(weights * js.settle(js.make_scene(h.shape, DX, angles, neighbours), h, stop=js.Sweeps(8)).height)
 
     angles, way = jnp.asarray(0.5 + rough((9, 10), "float64", seed=2)), rough((9, 10), "float64", seed=3)
     slope, value = jax.jit(jax.grad(loss))(angles), jax.jit(loss)
-    difference = float(value(angles + 1e-6 * way) - value(angles - 1e-6 * way)) / 2e-6
+    difference = float(value(angles + 1e-7 * way) - value(angles - 1e-7 * way)) / 2e-7
     assert float(jnp.sum(slope * way)) == pytest.approx(difference, rel=1e-5)
 
 
