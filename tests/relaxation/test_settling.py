@@ -307,6 +307,12 @@ def test_nothing_falls_below_a_draining_rim():
         js.settle(scene, h, scheme=js.Relaxation(0.3))
 
 
+def test_a_draining_rim_stands_half_a_cell_outside():
+    """In a row every cell touches it."""
+    scene = js.make_scene((1, 12), DX, ANGLE, edge=js.Draining(0.02))
+    assert np.asarray(js.settle(scene, np.full((1, 12), 0.1)).height) == pytest.approx(0.02 + MU * DX / 2, abs=1e-4)
+
+
 def test_traced_nonsense_and_overflow_are_flagged():
     h = np.zeros((6, 6), "float32")
     for angle in (np.nan, 2.0):

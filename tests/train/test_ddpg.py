@@ -15,7 +15,7 @@ from jaxsand.planning.stroke_loss import pushed
 from jaxsand.scene.scene import make_scene
 from jaxsand.scene.tools import Blade
 from train.ddpg.acting import Acts
-from train.ddpg.learner import Ddpg, begin, practise
+from train.ddpg.learner import Ddpg, _drawn, begin, practise
 from train.ddpg.learner import update as eager_update
 from train.ddpg.networks import Actor, Critic, Flat, Maps
 from train.ddpg.tasks import Strokes
@@ -121,6 +121,30 @@ def test_a_probe_has_no_goals_to_learn_from_in_hindsight():
     learner = replace(prober(Constant()), strategy=Future(2))
     with pytest.raises(ValueError, match="strategy: these observations hold no goal"):
         learner.advance(learner.init(0))
+    learner = replace(prober(Constant()), exchange=0.5)
+    with pytest.raises(ValueError, match="exchange: these observations hold no goal"):
+        learner.advance(learner.init(0))
+
+
+def test_half_of_what_is_learned_from_has_another_s_goal_and_all_is_rewarded_for_its_own():
+    learner = Ddpg(batch=64, steps=1)
+    maps = jnp.arange(64, dtype=jnp.float16)[:, None, None, None] * jnp.ones((1, 1, 4, 4), jnp.float16) / 64
+    none = jnp.zeros((64, 1), bool)
+    rows = Steps(
+        {"goal": -maps, "current": 0 * maps},
+        jnp.zeros((64, 1, 4)),
+        jnp.zeros((64, 1)),
+        none,
+        {"goal": -maps, "current": maps},
+        none,
+    )
+    some = _drawn(learner, jax.random.key(0), rows)
+    goal, made = some.after["goal"][:, 0, 0], some.after["current"][:, 0, 0]
+    others = np.asarray(jnp.abs(goal) != made)
+    assert 0.3 < others[1:].mean() < 0.7
+    kept = ~others & np.asarray(goal < 0)  # whose reward is the stored one
+    want = learner.task.reward(some.observation, some.after, some.reward)
+    np.testing.assert_allclose(np.where(kept, 0, want), np.where(kept, 0, some.reward), rtol=1e-5)
 
 
 def test_the_judge_rewards_what_is_gone_of_the_squared_distance_of_any_goal():

@@ -96,7 +96,8 @@ class Ddpg:
         arXiv:1802.09464): three fully connected layers of 256, both rates 1e-3, target copies that follow by 5%, batches of
         256, four goals in hindsight to one and none exchanged, 30% random actions, noise of 0.2, and a discount of 0.98.
         Assumed: episodes of three strokes towards what three random strokes make of level sand; the reward L_t - L_{t+1},
-        with L the squared distance; one update an episode, where that implementation makes 20, so that it ends in minutes.
+        with L the squared distance over 5; one update an episode, where that implementation makes 20, so that it ends in
+        minutes.
         """
         return cls(
             sight=Flat((256, 256, 256)),

@@ -93,8 +93,7 @@ def relabel(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> S
     Raises:
       ValueError: for observations without a goal.
     """
-    if not isinstance(steps.after, dict) or not {"goal", "current"} <= steps.after.keys():
-        raise ValueError("strategy: these observations hold no goal and current; learn without hindsight, by Own()")
+    _check_goals(steps, "strategy", "by Own()")
     which = strategy.outcome(key, last_steps(steps.ended))
     goal = jax.tree.map(lambda x: x[which], steps.after["current"])
     reward, terminated = jax.vmap(judge)(steps.observation["current"], steps.after["current"], goal)
@@ -122,9 +121,13 @@ def exchanged(key: jax.Array, steps: Steps, share: float, judge: Judge) -> Steps
 
     Hindsight alone shows to every goal in it the very action that reached it. A critic then need not look at the action: it
     can tell by the goal. Where goals are exchanged it sees the same goals with actions that miss them.
+
+    Raises:
+      ValueError: for observations without a goal.
     """
     if not share:
         return steps
+    _check_goals(steps, "exchange", "and with exchange=0")
     goal = jax.tree.map(lambda x: jnp.roll(x, 1, 0), steps.after["goal"])
     reward, terminated = jax.vmap(judge)(steps.observation["current"], steps.after["current"], goal)
     others = replace(
@@ -135,6 +138,11 @@ def exchanged(key: jax.Array, steps: Steps, share: float, judge: Judge) -> Steps
         after=steps.after | {"goal": goal},
     )
     return chosen(jax.random.uniform(key, reward.shape) < share, others, steps)
+
+
+def _check_goals(steps: Steps, field: str, remedy: str) -> None:
+    if not isinstance(steps.after, dict) or not {"goal", "current"} <= steps.after.keys():
+        raise ValueError(f"{field}: these observations hold no goal and current; learn without hindsight, {remedy}")
 
 
 def chosen(which: jax.Array, one: Steps, other: Steps) -> Steps:
