@@ -9,6 +9,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 import jaxsand as js
+from jaxsand.goals.writing import written
 
 RNG = np.random.default_rng(0)
 HEIGHT = RNG.normal(0, 0.01, (5, 7))
@@ -206,3 +207,11 @@ def test_a_npy_header_that_no_tokenizer_reads_is_named(tmp_path):
     (tmp_path / "x.npy").write_bytes(data.replace(b"}", b"(", 1))
     with pytest.raises(ValueError, match="x.npy: cannot be read as a height map"):
         js.read_map(tmp_path / "x.npy", spacing=0.1)
+
+
+def test_what_could_not_be_written_leaves_what_was_there_and_nothing_else(tmp_path):
+    (tmp_path / "a.txt").write_text("before")
+    with pytest.raises(RuntimeError, match="in between"), written(tmp_path / "a.txt") as path:
+        path.write_text("half")
+        raise RuntimeError("in between")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.txt", "before")]
