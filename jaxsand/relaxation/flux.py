@@ -268,9 +268,8 @@ def share_beyond(square: jax.Array, m: jax.Array) -> jax.Array:
     and another that it is not, the share must still be about 0: the length that is divided by is never below m.
     """
     least = m * m
-    size = jnp.sqrt(
-        jnp.where(square > least, square, jnp.where(least > 0, least, 1))
-    )  # 1: a derivative divides by its square
+    short = jnp.where(least > 0, least, 1)  # not 0: a derivative divides by it, and what comes out must be finite
+    size = jnp.sqrt(jnp.where(square > least, square, short))
     return jnp.where(square > least, 1 - m / size, 0)
 
 

@@ -95,16 +95,7 @@ def relabel(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> S
     """
     _check_goals(steps, "strategy", "by Own()")
     which = strategy.outcome(key, last_steps(steps.ended))
-    goal = jax.tree.map(lambda x: x[which], steps.after["current"])
-    reward, terminated = jax.vmap(judge)(steps.observation["current"], steps.after["current"], goal)
-    return Steps(
-        steps.observation | {"goal": goal},
-        steps.action,
-        reward.astype(steps.reward.dtype),
-        terminated,
-        steps.after | {"goal": goal},
-        steps.ended,
-    )
+    return _towards(jax.tree.map(lambda x: x[which], steps.after["current"]), steps, judge)
 
 
 def mixed(key: jax.Array, steps: Steps, strategy: Strategy, judge: Judge) -> Steps:
@@ -128,16 +119,20 @@ def exchanged(key: jax.Array, steps: Steps, share: float, judge: Judge) -> Steps
     if not share:
         return steps
     _check_goals(steps, "exchange", "and with exchange=0")
-    goal = jax.tree.map(lambda x: jnp.roll(x, 1, 0), steps.after["goal"])
+    others = _towards(jax.tree.map(lambda x: jnp.roll(x, 1, 0), steps.after["goal"]), steps, judge)
+    return chosen(jax.random.uniform(key, steps.ended.shape) < share, others, steps)
+
+
+def _towards(goal: Any, steps: Steps, judge: Judge) -> Steps:
+    """The same steps with other goals, and with the reward and the end that `judge` gives for these."""
     reward, terminated = jax.vmap(judge)(steps.observation["current"], steps.after["current"], goal)
-    others = replace(
+    return replace(
         steps,
         observation=steps.observation | {"goal": goal},
         reward=reward.astype(steps.reward.dtype),
         terminated=terminated,
         after=steps.after | {"goal": goal},
     )
-    return chosen(jax.random.uniform(key, reward.shape) < share, others, steps)
 
 
 def _check_goals(steps: Steps, field: str, remedy: str) -> None:
