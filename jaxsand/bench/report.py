@@ -5,7 +5,6 @@ call less a later one.
 """
 
 import math
-import os
 import platform
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -42,7 +41,7 @@ from jaxsand.bench.tables import Row, as_table
 from jaxsand.bench.timing import race
 from jaxsand.goals.usual import usual_scene
 from jaxsand.interaction.simulate import act
-from jaxsand.relaxation.batching import cores
+from jaxsand.relaxation.batching import cores, processors
 from jaxsand.relaxation.schemes import Relaxation, SuperTimeStepping
 from jaxsand.relaxation.settling import Settled, settle, settle_batch
 from jaxsand.relaxation.stopping import Sweeps, UntilStill
@@ -241,7 +240,7 @@ def _pushed(batch: int) -> tuple[Scene, jax.Array]:
 
 
 def _machine() -> str:
-    """The processor and the versions that the figures hold for."""
+    """The processor, how many of its cores were to be used, and the versions that the figures hold for."""
     name = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
@@ -249,4 +248,6 @@ def _machine() -> str:
     except (OSError, StopIteration):
         pass
     device = jax.devices()[0].device_kind
-    return f"{name}, {os.cpu_count()} cores, device {device}, jax {jax.__version__}, Python {platform.python_version()}"
+    count = processors()
+    used = f"{count} core{'s' * (count > 1)}"
+    return f"{name}, {used}, device {device}, jax {jax.__version__}, Python {platform.python_version()}"
