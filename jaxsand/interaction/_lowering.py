@@ -15,7 +15,6 @@ from jaxsand.interaction._frame import frame_of
 from jaxsand.interaction.stencil import inner
 from jaxsand.relaxation.ghost_cells import at, truncate
 
-_THIN = 2.0**-10  # spacings: a traced blade may have no width, or no thickness
 Params: TypeAlias = tuple[blade.Shares, jax.Array, jax.Array, tuple[jax.Array, jax.Array] | None]
 
 
@@ -39,7 +38,7 @@ class Lower(LegStep[Way]):
         along, across = inner(along), inner(across)
         bottom = self.block.above(view, way.bottom / way.quantum)
         taken = truncate(cover * jnp.maximum(old - bottom, 0)) * at(holds)
-        half, side = jnp.maximum(way.half, _THIN), jnp.maximum(way.side, _THIN)
+        half, side = jnp.maximum(way.half, blade.THIN), jnp.maximum(way.side, blade.THIN)
         s, n = along / (4 * half**2), across / (4 * side**2)
         p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
         size = jnp.maximum(jnp.abs(p), jnp.abs(q))

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
+from jaxsand.interaction._blade import THIN
 from jaxsand.interaction._displacement import Site, contact, settle_around, take, whole
 from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
 from jaxsand.interaction._overflow import RimAhead, nothing_beyond
@@ -41,7 +42,6 @@ _INTO, _DEEP = 0.78, 0.3  # 1 - exp(-_INTO - _DEEP (r / w)^3) of the berms has s
 _DEEPEST = 3.5  # r / w: beyond it, where a millionth stays outside, that share does not fall any more
 _INNER = 0.93  # how far it is strewn
 _BACK = 0.67  # of the sand under the blade when it is lowered: what leaves behind it and to its sides
-_THIN = 2.0**-10  # spacings: a traced blade may have no width, or no thickness
 _FAR = 50.0  # times the blade's thickness: no sand comes from farther back sooner than from there
 _ACROSS = (np.arange(16) - 7.5) / 8
 ROOM = 0.25  # with less room than this part of a profile's own, sand is held back
@@ -133,7 +133,7 @@ def _sweep_out(  # noqa: PLR0915
 ) -> tuple[jax.Array, ExactSum | None]:
     """One leg: takes up the sand in the way and sets it down."""
     dx, tool = site.bed.spacing, site.tool
-    half, side = (jnp.maximum(jnp.asarray(size) / 2, _THIN * dx) for size in (tool.thickness, tool.width))
+    half, side = (jnp.maximum(jnp.asarray(size) / 2, THIN * dx) for size in (tool.thickness, tool.width))
     first_pose, under = pose, coverage(tool, pose, site.x, site.y, dx)
     _, pose, length = over_the_map(scene, site, pose, length)
     cover = coverage(tool, pose, site.x, site.y, dx, length)

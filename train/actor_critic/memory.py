@@ -11,9 +11,9 @@ import jax
 import numpy as np
 
 from jaxsand.goals.usual import SHAPE
+from train.replay.reward import far
 
 _OWN, _TRIED = 0.4, 0.1  # shares of states that keep their goal, and whose goal is what a stroke tried from them left
-_UNIT = 5.0  # squared depths of the blade over cells: a stroke that is due gains about 3 of it
 
 
 @jax.tree_util.register_dataclass
@@ -93,13 +93,4 @@ def draw(memory: Memory, rng: np.random.Generator, count: int) -> Batch:
     chance = rng.random((count, 1, 1))
     goal = np.where(chance < _OWN, ring.goal[which], np.where(chance < _OWN + _TRIED, tried, future)).astype(np.float32)
     current, after = ring.current[which].astype(np.float32), ring.after[which].astype(np.float32)
-    return Batch(goal, current, ring.strokes[which], rewards(goal, current, after))
-
-
-def rewards(goal: np.ndarray, current: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """By how much strokes bring maps closer: (|g - h|^2 - |g - h'|^2) / 5, [B, K] for maps [B, H, W] and [B, K, H, W].
-
-    The sum of an episode's rewards is the squared distance that it gained.
-    """
-    before = ((goal - current) ** 2).sum((1, 2))
-    return (before[:, None] - ((goal[:, None] - after) ** 2).sum((2, 3))) / _UNIT
+    return Batch(goal, current, ring.strokes[which], far(goal, current)[:, None] - far(goal[:, None], after))

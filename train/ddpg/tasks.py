@@ -18,11 +18,11 @@ from jaxsand.scene.tools import Blade
 from train.ddpg.acting import Acts
 from train.evaluation.probes import Probe
 from train.replay.her import Observation
+from train.replay.reward import far
 
 _PRACTICE, _SET_APART = 2_000_029, 1_000_003  # seeds of goals
 _ENV = MultiStroke()
 _SHORTEST = 0.15  # stroke of a goal, of the glyphs' square
-_UNIT = 5.0  # of rewards: squared depths over cells
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Strokes:
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The reward for any goal, from maps [..., H, W] in units of the blade's depth, and False: no goal ends an episode.
 
-        It is what a stroke takes off the squared distance, L_t - L_{t+1} with L = |g - h|^2 / 5. Strokes that lie apart then
-        gain what each would gain alone, which the distance itself, the environment's reward, does not say.
+        It is what a stroke takes off the squared distance, L_t - L_{t+1} with L = |g - h|^2 / 5. The
+        environment's reward is of the distance itself.
         """
-        return _far(goal, before) - _far(goal, after), jnp.zeros(before.shape[:-2], bool)
+        return far(goal, before) - far(goal, after), jnp.zeros(before.shape[:-2], bool)
 
     def reward(self, observation: Observation, after: Observation, given: jax.Array) -> jax.Array:
         """The rewards [B] of steps, to which the environment gave others."""
@@ -57,7 +57,7 @@ class Strokes:
 
         sum_t g^t (L_t - L_{t+1}) = L_0 - (1 - g) sum_t g^t L_{t+1} <= L_0.
         """
-        return _far(observation["goal"], observation["current"])
+        return far(observation["goal"], observation["current"])
 
     def validate(self, acts: Acts) -> dict[str, float]:
         """Judges a policy on goals set apart.
@@ -69,9 +69,9 @@ class Strokes:
         goal, depth = np.asarray(params.goals.goals), float(Blade().depth)
         _, maps = one_after_the_other(acts, params.scene, np.zeros_like(goal), goal, self.count)
         after = np.nan_to_num(maps[-1])
-        far, left = (np.asarray(metrics.l2(goal, x)) for x in (maps[0], after))
+        before, left = (np.asarray(metrics.l2(goal, x)) for x in (maps[0], after))
         good = [right(g, x, depth) for g, x in zip(goal, after, strict=True)]
-        return {"score": float(np.mean(1 - left / far)), "right": float(np.mean(good))}
+        return {"score": float(np.mean(1 - left / before)), "right": float(np.mean(good))}
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,6 @@ class Probing:
 
 
 Task = Strokes | Probing
-
-
-def _far(goal: jax.Array, height: jax.Array) -> jax.Array:
-    """The squared distance [...] of maps [..., H, W] in units of the blade's depth, divided by 5."""
-    return jnp.sum((goal - height) ** 2, (-2, -1)) / _UNIT
 
 
 @cache
