@@ -35,10 +35,9 @@ HURRY = {
 }
 OLDER = {"xla_cpu_use_fusion_emitters": False}
 WAYS = {"compiled": {}, "long": OLDER}
-COMPUTING = ("planning", "terramechanics", "train")
-"""XLA's options by a test's marker; slow tests of these rooms are long, too. In a hurry programs are compiled six times as
-fast, and run four times as slowly; by the older emitters alone they are compiled twice as fast, and run as fast, but for a few
-large derivatives, which those take for ever to compile."""
+"""XLA's options by a test's marker. In a hurry programs are compiled six times as fast, and run two to four times as slowly; by
+the older emitters alone they are compiled twice as fast, and run as fast, but for a few large derivatives and for what draws
+many random numbers, which those take for ever to compile."""
 
 GROUPS = batching.SIZES
 ONE_SIZE = {min(GROUPS): 1.0}
@@ -78,8 +77,7 @@ _compile(HURRY)  # what modules compute when they are imported
 
 
 def _way(item: pytest.Item) -> dict[str, Any]:
-    long = item.get_closest_marker("slow") and item.path.parent.name in COMPUTING
-    return next((options for name, options in WAYS.items() if item.get_closest_marker(name)), OLDER if long else HURRY)
+    return next((options for name, options in WAYS.items() if item.get_closest_marker(name)), HURRY)
 
 
 def _hurried(item: pytest.Item) -> bool:

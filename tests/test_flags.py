@@ -85,9 +85,8 @@ def test_a_push(kind, push):
 
 
 @SLOW
-@pytest.mark.parametrize("kind", [DRAINED, ISOTROPIC])
-def test_a_path(kind):
-    sand = scene(kind)
+def test_a_path():
+    sand = scene(ISOTROPIC)
     gradient(lambda h, s: js.follow(sand, h, s, push=QUICK, stop=STOP), MAP, PATH)
 
 

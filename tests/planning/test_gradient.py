@@ -116,6 +116,7 @@ def test_a_stroke_is_found_within_the_budget_and_again_by_the_same_key(short):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_letter_is_found_within_the_budget_and_again_by_the_same_key(tee):
     found = js.optimise_strokes(tee.scene, tee.goal, strokes=2, key=3, budget=300)
     assert found.strokes.shape == (2, 4)
@@ -139,7 +140,7 @@ def test_the_number_of_strokes_is_found(name, request):
 
 
 @pytest.mark.wide
-@pytest.mark.parametrize("strokes", [1, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("strokes", [1, pytest.param(None, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_strokes_that_would_make_it_worse_are_not_given(short, strokes):
     bump = np.zeros((16, 16), np.float32)
     bump[4:8, 4:8] = 5e-4

@@ -94,6 +94,7 @@ def test_goals_that_are_none_are_named(goals, message):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_gradients_bring_a_ramp_closer(found):
     """Some 140 pushes go to the strokes' order and direction first."""
     refined = js.optimise_strokes(SCENE, RAMP, guess=found.strokes, budget=600)
@@ -150,6 +151,7 @@ def test_gradients_in_a_search_cost_no_more_than_its_budget(monkeypatch, strokes
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_search_that_ends_with_gradients_comes_closer(monkeypatch):
     with_them = js.plan_sand(SCENE, LEVEL, RAMP, strokes=4, actions=js.Rising(), budget=1000)
     monkeypatch.setattr(heights, "_PAYS", 1001)

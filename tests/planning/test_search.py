@@ -270,6 +270,7 @@ def test_every_task_is_at_rest_and_has_something_to_do():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_search_ends_a_fifth_closer_than_its_rivals():
     """On one task of those of `jaxsand bench sand`."""
     rows = bench_sand(names=("crossing",))

@@ -17,6 +17,7 @@ from ..conftest import ANGLE
 SHAPE = (72, 80)
 ROUNDING = 3e-16
 DX = 0.01
+AS_USERS_COMPILE = [pytest.mark.slow, pytest.mark.compiled]
 
 
 def sand(window=None, shape=SHAPE):
@@ -24,12 +25,11 @@ def sand(window=None, shape=SHAPE):
 
 
 @pytest.mark.wide
-@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(
     ("shape", "sizes"),
     [
         ((44, 48), ((6, 6), (30, 30))),
-        pytest.param(SHAPE, ((6, 6), (28, 28), (56, 56), (72, 80)), marks=pytest.mark.slow),
+        pytest.param(SHAPE, ((6, 6), (28, 28), (56, 56), (72, 80)), marks=AS_USERS_COMPILE),
     ],
 )
 def test_equal_or_flagged(shape, sizes):
@@ -52,8 +52,7 @@ def test_equal_or_flagged(shape, sizes):
 
 
 @pytest.mark.wide
-@pytest.mark.usefixtures("both_ways")
-@pytest.mark.parametrize("many", [4, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("many", [4, pytest.param(8, marks=AS_USERS_COMPILE)])
 def test_the_default_tolerance_keeps_the_difference_small(many):
     strokes = jnp.asarray(np.random.default_rng(1).uniform([0.1, 0.1, 0.1, 0.1], [0.7, 0.6, 0.7, 0.6], (8, 4)))[:many]
     whole = jax.vmap(lambda s: js.step(sand(js.Whole()), jnp.zeros(SHAPE), s).height)(strokes)
@@ -119,9 +118,10 @@ def heaps(many=24):
 @pytest.mark.parametrize(
     ("scheme", "neighbours"),
     [
-        pytest.param(s, n, marks=mark if n == alone else pytest.mark.slow)
-        for s, alone, mark in ((js.Relaxation(), 8, ()), (js.SuperTimeStepping(), 4, pytest.mark.wide))
-        for n in (4, 8, "isotropic")
+        (js.Relaxation(), 8),
+        pytest.param(js.Relaxation(), "isotropic", marks=pytest.mark.slow),
+        pytest.param(js.SuperTimeStepping(), 4, marks=pytest.mark.wide),
+        pytest.param(js.SuperTimeStepping(), 8, marks=pytest.mark.slow),
     ],
 )
 def test_settling_in_a_window_is_equal_or_flagged(scheme, neighbours):

@@ -77,6 +77,7 @@ def check_cones(rows):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_exact_cones_angle_lies_within_two_stated_errors(monkeypatch):
     """In all of 20 trials but one; `jaxsand bench calibrate` has a hundred."""
     monkeypatch.setattr("jaxsand.bench.calibration._seconds", lambda *_: 0.0)  # no clock is asked
@@ -146,7 +147,9 @@ def test_an_error_that_is_not_known_is_no_number():
 
 
 @pytest.mark.wide
-@pytest.mark.parametrize("push", [js.SwathPush(), pytest.param(js.SteppedPush(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "push", [js.SwathPush(), pytest.param(js.SteppedPush(), marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_a_push_tells_the_angle_and_the_blade(push):
     """To rounding without noise, from lengths off by half; within four standard errors with it."""
     pushed = np.asarray(js.step(sand(31, js.Blade()), LEVEL, STROKE, push=push).height)

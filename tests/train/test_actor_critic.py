@@ -265,7 +265,6 @@ def shown(generator, count):
 
 
 @pytest.mark.wide
-@pytest.mark.long
 def test_it_finds_the_known_values_of_a_probe_on_maps():
     learner = replace(TINY, batch=16, widths=(16, 16, 16), rate=4e-3, decay=200)
     state, generator = learner.init(0), rng(3)

@@ -223,6 +223,7 @@ def test_the_paper_s_setting_is_ddpg_with_hindsight_on_flat_layers_for_ten_thous
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_one_stroke_on_sand_is_learned():
     learner = Ddpg(task=Strokes(count=1, goals=256, trials=32), steps=1)
     state = learner.init(0)
