@@ -142,7 +142,6 @@ def check_smooth_points(case, least, most, batch=30):
 
 
 @pytest.mark.slow
-@pytest.mark.compiled
 @pytest.mark.parametrize("case", CASES[:6], ids=lambda case: case.name)
 def test_gradients_are_right_at_smooth_points(case):
     """At a thousand a tool by `jaxsand bench tools --points 1000`."""
