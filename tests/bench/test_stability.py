@@ -52,7 +52,6 @@ def test_the_judge_is_not_blind():
 
 
 @pytest.mark.slow
-@pytest.mark.long
 def test_hard_numbers_on_a_large_map_and_over_many_pushes():
     """`jaxsand bench stability` takes 1024 cells a side and 100,000 pushes, in 20 minutes."""
     rows = stability(128, 1_000)
