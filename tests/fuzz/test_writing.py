@@ -1,7 +1,6 @@
 """Files are whole or not there: what a full disk, a folder that cannot be written to, or a kill leaves."""
 
 import errno
-import json
 import os
 import random
 import signal
@@ -24,6 +23,8 @@ from jaxsand.planning.waypoints import write_waypoints
 from train.runs.runs import run as train
 
 from ..train.test_runs import Tiny
+from .judge import BrokenError
+from .kills import JOBS, killed_often, whole
 
 HEIGHT = np.random.default_rng(0).normal(size=(40, 40))
 ROOT = Path(__file__).parents[2]
@@ -241,37 +242,23 @@ def test_two_benches_that_are_killed_leave_rows_that_are_whole(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "files", "longest"),
-    [
-        (["plan", "S", "--out", "out"], ["plan-S.json", "plan-S.png"], 5.0),
-        (["shape", "L", "--out", "out"], ["result.json", "shape.gif", "shape.png"], 25.0),
-    ],
-)
-def test_a_command_that_is_killed_leaves_whole_files(tmp_path, words, files, longest):
-    """Each file is the old one or the new one, whenever the kill comes."""
+@pytest.mark.parametrize("name", ["plan", "shape"])
+def test_a_command_that_is_killed_leaves_whole_files(tmp_path, name):
+    """Each file is the old one or the new one; `python -m tests.fuzz.kills` has more commands and more kills."""
+    assert killed_often(JOBS[name], 8, tmp_path).startswith("8 kills")
+
+
+def test_a_file_that_is_cut_off_is_seen(tmp_path):
     from PIL import Image
 
-    folder = tmp_path / "work"
-    folder.mkdir()
-    with child(["-m", "jaxsand", *words], folder) as process:
-        process.wait()
-    chance = random.Random(1)
-    for _ in range(8):
-        for path in (folder / "out").iterdir():
-            path.unlink() if path.name.startswith(".") else os.utime(path, (1, 1))
-        with child(["-m", "jaxsand", *words], folder) as process:
-            try:
-                process.wait(longest * chance.random())
-            except subprocess.TimeoutExpired:
-                process.kill()
-        for name in files:
-            path = folder / "out" / name
-            if path.suffix == ".json":
-                assert json.loads(path.read_text())
-            else:
-                with Image.open(path) as image:
-                    image.load()
+    Image.fromarray(np.uint8(HEIGHT)).save(tmp_path / "a.png")
+    np.savez(tmp_path / "a.npz", HEIGHT)
+    write_json(tmp_path / "a.json", {"a": HEIGHT.tolist()})
+    for path in sorted(tmp_path.iterdir()):
+        whole(path)
+        path.write_bytes(path.read_bytes()[:-30])
+        with pytest.raises(BrokenError, match=f"{path.name} is not whole"):
+            whole(path)
 
 
 AS_OTHERS = """
