@@ -54,5 +54,5 @@ def test_the_judge_is_not_blind():
 @pytest.mark.slow
 def test_hard_numbers_on_a_large_map_and_over_many_pushes():
     """`jaxsand bench stability` takes 1024 cells a side and 100,000 pushes, in 20 minutes."""
-    rows = stability(128, 1_000)
+    rows = stability(128, 1_000, only=lambda case: not usual(case) or "column" in case.name)
     assert all(row["right"] for row in rows), wrong(rows)

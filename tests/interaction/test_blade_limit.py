@@ -150,10 +150,16 @@ def test_isotropic_sand_moves_alike_in_float32():
 
 @pytest.mark.slow
 @pytest.mark.long
-@pytest.mark.parametrize(("tool", "most"), [(js.Blade(), 1e-3), (js.Wheel(), 0.02)])
+@pytest.mark.parametrize(
+    ("tool", "push", "most"),
+    [
+        (js.Blade(), js.SteppedPush(), 1e-3),
+        (js.Blade(), js.SteppedPush(1 / 32, 32), 1e-3),
+        (js.Wheel(), js.SteppedPush(), 0.02),
+    ],
+)
 @pytest.mark.parametrize("neighbours", [4, 8, "isotropic"])
-@pytest.mark.parametrize("push", [js.SteppedPush(), js.SteppedPush(1 / 32, 32)])
-def test_random_pushes_move_alike_in_float32(tool, most, neighbours, push):
+def test_random_pushes_move_alike_in_float32(tool, push, most, neighbours):
     sand, strokes = square(32, neighbours, tool=tool), np.random.default_rng(1).uniform(0.04, 0.28, (32, 4))
     maps = [np.asarray(js.step_batch(sand, np.zeros((32, 32, 32), d), strokes, push=push).height) for d in ("f4", "f8")]
     apart = np.abs(maps[0] - maps[1]).sum((1, 2)) / np.abs(maps[1]).sum((1, 2))

@@ -76,7 +76,7 @@ def test_no_sand_inside_the_tool(dtype):
 
 @pytest.mark.wide
 @pytest.mark.long
-@pytest.mark.parametrize("n", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [100, pytest.param(500, marks=pytest.mark.slow)])
 def test_volume_after_many_random_pushes(n):
     shape = (32, 32)
     sand = js.make_scene(shape, 0.01, ANGLE, tool=js.Blade())
