@@ -15,7 +15,7 @@ from .judge import BrokenError, judged
 FEW = {"read-policy": 6, "read-config": 20, "command-jaxsand": 40, "command-train": 4, "command-heavy": 0}
 COMPILED = ("step", "follow", "settle", "scoop", "dump", "deposit", "rollout")
 FEW |= {f"call-{name}": 12 for name in COMPILED}
-MANY = {"read-policy": 200, "command-train": 150, "command-heavy": 12}
+MANY = {"read-policy": 200, "command-train": 150, "command-heavy": 8}
 """Cases of an entrance where they are not 30, or 400 among the slow ones: 10,000 in all."""
 
 

@@ -250,7 +250,7 @@ def test_without_others_goals_the_critic_does_not_look_at_the_action(exchange, l
     """By hindsight alone it values strokes as high on goals that they miss as on those they made; 5 apart they should be."""
     learner = Ddpg(task=Strokes(count=1, goals=256, trials=32), steps=1, exchange=exchange, updates=32)
     state = learner.init(0)
-    for _ in range(8):
+    for _ in range(6):
         state, _ = learner.advance(state)
     env, params = learner.world()
     actions = jax.random.uniform(jax.random.key(1), (32, 4), jnp.float32, -1, 1)
