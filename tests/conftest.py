@@ -2,9 +2,12 @@
 
 import gc
 import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")  # a worker a core: more threads only wait
 
 import jax
 import numpy as np
@@ -134,5 +137,6 @@ def dtype(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(params=["hurried", pytest.param("compiled", marks=[pytest.mark.slow, pytest.mark.compiled])])
-def both_ways() -> None:
+def both_ways(request: pytest.FixtureRequest) -> str:
     """By default a test runs in a hurry, and among the slow ones again, compiled as users do."""
+    return request.param

