@@ -23,7 +23,7 @@ from jaxsand.relaxation.flux import Fluxes
 from jaxsand.relaxation.ghost_cells import ExactSum, at, counted, truncate
 from jaxsand.scene.grid import Neighbours
 
-THIN = 2.0**-10  # spacings: a traced blade may have no width, or no thickness
+LEAST_SIZE = 2.0**-10  # spacings: a traced blade may have no width, or no thickness
 _LEAST = 1e-4
 SLIVER = 0.02  # the smallest open share that is divided by: in a narrower one sand stands as high as in this
 _SINKS = 0.02  # the slope from which on a blade counts as sinking in full

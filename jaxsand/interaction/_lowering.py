@@ -38,7 +38,7 @@ class Lower(LegStep[Way]):
         along, across = inner(along), inner(across)
         bottom = self.block.above(view, way.bottom / way.quantum)
         taken = truncate(cover * jnp.maximum(old - bottom, 0)) * at(holds)
-        half, side = jnp.maximum(way.half, blade.THIN), jnp.maximum(way.side, blade.THIN)
+        half, side = jnp.maximum(way.half, blade.LEAST_SIZE), jnp.maximum(way.side, blade.LEAST_SIZE)
         s, n = along / (4 * half**2), across / (4 * side**2)
         p, q = s * pose.cos - n * pose.sin, s * pose.sin + n * pose.cos
         size = jnp.maximum(jnp.abs(p), jnp.abs(q))

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsand.autodiff.while_loop import Tree
-from jaxsand.interaction._blade import THIN
+from jaxsand.interaction._blade import LEAST_SIZE
 from jaxsand.interaction._displacement import Site, contact, settle_around, take, whole
 from jaxsand.interaction._mound import Lean, heights, held, lean, reach_of, unbounded
 from jaxsand.interaction._overflow import RimAhead, nothing_beyond
@@ -133,7 +133,7 @@ def _sweep_out(  # noqa: PLR0915
 ) -> tuple[jax.Array, ExactSum | None]:
     """One leg: takes up the sand in the way and sets it down."""
     dx, tool = site.bed.spacing, site.tool
-    half, side = (jnp.maximum(jnp.asarray(size) / 2, THIN * dx) for size in (tool.thickness, tool.width))
+    half, side = (jnp.maximum(jnp.asarray(size) / 2, LEAST_SIZE * dx) for size in (tool.thickness, tool.width))
     first_pose, under = pose, coverage(tool, pose, site.x, site.y, dx)
     _, pose, length = over_the_map(scene, site, pose, length)
     cover = coverage(tool, pose, site.x, site.y, dx, length)

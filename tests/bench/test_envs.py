@@ -10,7 +10,7 @@ from jaxsand.bench import envs
 from jaxsand.bench.envs import bench_env
 from jaxsand.bench.report import table
 
-STEPPED = "full push", "dig", "fast push", "walk on sand"
+ON_SAND = "full push", "push with heights", "dig", "fast push", "walk on sand"
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ print(*(f"{row['name']};{row['batch']};{row['steps_per_second'] > 0}" for row in
 
 
 @pytest.mark.wide
-@pytest.mark.parametrize("kinds", [("walk on a map",), pytest.param(STEPPED, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kinds", [("walk on a map",), pytest.param(ON_SAND, marks=pytest.mark.slow)])
 def test_every_way_has_a_rate_and_is_set_against_gymnasium(kinds, monkeypatch):
     for name, few in (("_ROUNDS", 1), ("_STEPS", 1), ("_ALONE", 2), ("_COMPARED", 32)):
         monkeypatch.setattr(envs, name, few)
@@ -51,4 +51,4 @@ def test_every_way_has_a_rate_and_is_set_against_gymnasium(kinds, monkeypatch):
         assert 0 < row.get("error_percent", 0.1) < 5
     assert len(rows) == 2 * len(kinds) + 5 * ("full push" in kinds) + 2 * ("fast push" in kinds)
     shown = table({"machine": "", "batch": 8, "env": rows}).splitlines()
-    assert any(line.startswith("walk on a map Gymnasium, one by one") for line in shown)
+    assert any(line.startswith(f"{kinds[-1]} Gymnasium, one by one") for line in shown)

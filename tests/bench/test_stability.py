@@ -24,7 +24,7 @@ def telling(case):
 @pytest.mark.wide
 @pytest.mark.parametrize(("only", "least"), [(telling, 20), pytest.param(usual, 60, marks=pytest.mark.slow)])
 def test_hard_numbers(only, least):
-    """By the default scheme; another slow test takes the others too."""
+    """By the default scheme; another slow test takes the others."""
     rows = stability(64, 20, only=only)
     assert len(rows) > least
     assert all(row["right"] for row in rows), wrong(rows)

@@ -37,7 +37,7 @@ class Job:
 
     Attributes:
       words: what Python is called with.
-      more: words that go on with what is there.
+      more: words that go on with what is there, once `out` has a configuration.
       result: of what it has ended with, what has to be the same however often it was gone on with; None if it starts anew.
     """
 
@@ -48,29 +48,35 @@ class Job:
 
 def _rows(out: Path) -> list[dict[str, Any]]:
     rows = known_rows(out / "strokes.jsonl", {"goal"})
+    if not rows:
+        raise BrokenError("strokes.jsonl has no rows")
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
 
 
 def _trained(out: Path) -> list[Any]:
-    rows = known_rows(out / "metrics.jsonl", {"kind"})
-    losses = [{name: value for name, value in row.items() if "second" not in name} for row in rows]
+    timed = {"seconds", "chunks_per_second"}
+    rows = known_rows(out / "metrics.jsonl", {"kind", "chunk"})
     with np.load(out / "last.npz") as parts:
-        return [losses, {name: parts[name].tobytes() for name in parts if "second" not in name}]
+        about = json.loads(str(parts["about"]))
+        state = {name: parts[name].tobytes() for name in parts if name != "about"}
+    return [[{k: v for k, v in row.items() if k not in timed} for row in rows], about["chunk"], about["score"], state]
 
 
 JOBS = {
     "plan": Job(["-m", "jaxsand", "plan", "S", "--out", "out"]),
     "shape": Job(["-m", "jaxsand", "shape", "L", "--out", "out"]),
     "strokes": Job(
-        ["-m", "jaxsand", "bench", "strokes", "--methods", "random", "--calls", "250", "--out", "out"], result=_rows
+        ["-m", "jaxsand", "bench", "strokes", "--methods", "random shooting", "--calls", "250", "--out", "out"], result=_rows
     ),
     "train": Job(["-m", "train", "dqn", "--steps", "60", "--out", "out"], ["--resume"], _trained),
 }
+LIMIT = 900.0
+"""Seconds after which a command that nobody kills hangs."""
 
 
 def whole(path: Path) -> None:
-    """Reads a file. BrokenError if it is not a whole one."""
-    from PIL import Image
+    """Reads a file, but for rows, of which a kill may cut off the last. BrokenError if it is not a whole one."""
+    from PIL import Image, ImageSequence
 
     try:
         if path.suffix == ".json":
@@ -80,59 +86,78 @@ def whole(path: Path) -> None:
                 dict(parts)
         elif path.suffix in {".png", ".gif"}:
             with Image.open(path) as image:
-                image.load()
-    except (OSError, ValueError, SyntaxError, zipfile.BadZipFile) as error:
+                for frame in ImageSequence.Iterator(image):
+                    frame.load()
+            if path.suffix == ".gif" and not path.read_bytes().endswith(b";"):
+                raise ValueError("it has no end")
+        elif path.suffix != ".jsonl":
+            raise BrokenError(f"{path.name}: no one knows how to read it")
+    except (OSError, EOFError, ValueError, SyntaxError, zipfile.BadZipFile) as error:
         raise BrokenError(f"{path.name} is not whole: {error}") from error
 
 
 def killed_often(job: Job, kills: int, folder: Path, seed: int = 0) -> str:
     """Kills a command so often in an empty folder; says what was seen. BrokenError if it broke something."""
     chance, out = random.Random(seed), folder / "out"
-
-    def end() -> Any:
-        """What the command has ended with, which is taken away if one could go on with it."""
-        result = job.result(out) if job.result else None
-        if job.result:
-            shutil.rmtree(out)
-        return result
-
-    _runs(job, folder)  # what it compiles may be kept
-    files, undisturbed = {path.name for path in out.iterdir()}, end()
+    ended_in_time(job, folder, LIMIT)  # what it compiles may be kept
+    files = {path.name for path in out.iterdir()}
+    undisturbed = _taken(job, out)
     began = time.monotonic()
-    _runs(job, folder)
+    ended_in_time(job, folder, LIMIT)
     longest, killed, ended = time.monotonic() - began, 0, 0
-    while killed < kills or (job.result and not ended):
-        done = _runs(job, folder, longest * chance.random() if killed < kills else None)
+    if _taken(job, out) != undisturbed:
+        raise BrokenError("undisturbed, it ends otherwise each time")
+    while killed < kills:
+        done = ended_in_time(job, folder, longest * chance.random())
         killed, ended = killed + (not done), ended + done
         there = files & {path.name for path in out.iterdir()} if out.exists() else set[str]()
         for name in there:
             whole(out / name)
         if not job.result and there < files:
             raise BrokenError(f"gone: {', '.join(files - there)}")
-        if done and end() != undisturbed:
-            raise BrokenError("gone on with, it ended otherwise than undisturbed")
-    return f"{killed} kills, each within {longest:.0f} s of a start; ended {ended} times"
+        if done and _taken(job, out) != undisturbed:
+            raise BrokenError("gone on with, it ends otherwise than undisturbed")
+    ended_in_time(job, folder, LIMIT)
+    if _taken(job, out) != undisturbed:
+        raise BrokenError("gone on with, it ends otherwise than undisturbed")
+    return f"{killed} kills, each within {longest:.0f} s of a start; ended {ended + 1} times"
 
 
-def _runs(job: Job, folder: Path, seconds: float | None = None) -> bool:
-    """Whether the command ended within so many seconds; it is killed if not."""
+def _taken(job: Job, out: Path) -> Any:
+    """What a command has ended with, which is taken away lest it be gone on with; None if it starts anew."""
+    if not job.result:
+        return None
+    result = job.result(out)
+    shutil.rmtree(out)
+    return result
+
+
+def ended_in_time(job: Job, folder: Path, seconds: float) -> bool:
+    """Runs a command in a folder, for so many seconds at most: whether it has ended; else it is killed.
+
+    Raises:
+      BrokenError: if it failed, or hangs.
+    """
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "XDG_CACHE_HOME": str(folder / "cache"),
         "MPLCONFIGDIR": str(folder / "cache"),
         "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
     }
-    goes_on = job.more if (folder / "out" / "config.json").exists() else ()
-    words = [sys.executable, *job.words, *goes_on]
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    with subprocess.Popen(words, cwd=folder, env=environment, **pipes) as process:
+    words = [sys.executable, *job.words, *(job.more if (folder / "out" / "config.json").exists() else ())]
+    with subprocess.Popen(
+        words, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
             _, said = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
-            process.kill()
+            if seconds == LIMIT:
+                raise BrokenError(f"not done after {seconds:g} s") from None
             return False
+        finally:
+            process.kill()
     if process.returncode:
-        raise BrokenError(f"ended with {process.returncode}: {said.decode()[-500:]}")
+        raise BrokenError(f"ended with {process.returncode}: {said[-500:]}")
     return True
 
 

@@ -24,7 +24,7 @@ from train.runs.runs import run as train
 
 from ..train.test_runs import Tiny
 from .judge import BrokenError
-from .kills import JOBS, killed_often, whole
+from .kills import JOBS, Job, killed_often, whole
 
 HEIGHT = np.random.default_rng(0).normal(size=(40, 40))
 ROOT = Path(__file__).parents[2]
@@ -245,7 +245,41 @@ def test_two_benches_that_are_killed_leave_rows_that_are_whole(tmp_path):
 @pytest.mark.parametrize("name", ["plan", "shape"])
 def test_a_command_that_is_killed_leaves_whole_files(tmp_path, name):
     """Each file is the old one or the new one; `python -m tests.fuzz.kills` has more commands and more kills."""
-    assert killed_often(JOBS[name], 8, tmp_path).startswith("8 kills")
+    killed_often(JOBS[name], 8, tmp_path)
+
+
+COUNT = """
+import json, pathlib, sys, time
+out = pathlib.Path("out")
+out.mkdir(exist_ok=True)
+config, kept = out / "config.json", out / "kept.json"
+if not config.exists():
+    (out / "part").write_text("{}")
+    (out / "part").replace(config)
+number = json.loads(kept.read_text()) if kept.exists() else 0
+while number < 20:
+    time.sleep(0.005)
+    number += 1
+    (out / "part").write_text(json.dumps(number))
+    (out / "part").replace(kept)
+"""
+SPOILT = {
+    "as it should be": ("", None),
+    "forgets where it was": ('"--on" in sys.argv and kept.write_text("21")', "ends otherwise than undisturbed"),
+    "leaves half a file": ("time.sleep(0.01); kept.write_text('{'); time.sleep(0.5)", "kept.json is not whole"),
+    "is never the same": ("kept.write_text(str(time.time()))", "ends otherwise each time"),
+    "fails": ("sys.exit('no more')", "ended with 1: no more"),
+}
+
+
+@pytest.mark.parametrize(("then", "said"), SPOILT.values(), ids=SPOILT)
+def test_what_a_kill_breaks_is_seen(tmp_path, then, said):
+    job = Job(["-c", COUNT + then], ["--on"], lambda out: (out / "kept.json").read_text())
+    if said is None:
+        assert killed_often(job, 4, tmp_path).startswith("4 kills")
+        return
+    with pytest.raises(BrokenError, match=said):
+        killed_often(job, 40, tmp_path)
 
 
 def test_a_file_that_is_cut_off_is_seen(tmp_path):

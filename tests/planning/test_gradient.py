@@ -125,6 +125,7 @@ def test_a_letter_is_found_within_the_budget_and_again_by_the_same_key(tee):
     assert np.all(np.diff(found.calls) > 0)
     assert found.calls[-1] <= found.spent <= 300
     one, other = (js.optimise_strokes(tee.scene, tee.goal, strokes=2, key=key, budget=50) for key in (3, jax.random.key(3)))
+    assert len(one.strokes) == 2
     assert np.array_equal(one.strokes, other.strokes)
 
 

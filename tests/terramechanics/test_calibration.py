@@ -159,7 +159,8 @@ def test_a_push_tells_the_angle_and_the_blade(push):
     assert abs(off(found, 31)) < 0.01
     assert found.values["width"] == pytest.approx(0.02, rel=1e-4)
     assert found.model.tool.depth == pytest.approx(0.0075, rel=1e-4)
-    noisy = js.calibrate(found.model, js.Trial(LEVEL, pushed + noise(1), STROKE), push=push, grid=js.OneGrid())
+    near = sand(29, js.Blade(0.021, 0.015, 0.0072))
+    noisy = js.calibrate(near, js.Trial(LEVEL, pushed + noise(1), STROKE), push=push, grid=js.OneGrid())
     assert noisy.verdict == js.Verdict.GRID_UNKNOWN
     true = (math.radians(31), 0.02, 0.0075)
     for value, error, known in zip(noisy.values.values(), noisy.noise_errors.values(), true, strict=True):

@@ -117,17 +117,18 @@ if moment == "half written":
             os.ftruncate(number, 100)
             die()
     os.fsync = fsync
-if moment in ("before the rename", "between both"):
+if moment in ("before the rename", "between both", "before there is a last"):
     put, puts = Path.replace, [0]
     def replace(self, target):
         puts[0] += self.name == "best.npz.part"
         if moment == "before the rename" and puts[0] == 2:
             die()
         put(self, target)
-        if moment == "between both" and puts[0] == 2:
+        if puts[0] == {"between both": 2, "before there is a last": 1}.get(moment):
             die()
     Path.replace = replace
-run(Tiny(pause=0.02 if moment == "any" else 0.0), out, 3, steps=40, resume=resume, save_every=0.05)
+seldom = 100.0 if moment == "before there is a last" else 0.05
+run(Tiny(pause=0.02 if moment == "any" else 0.0), out, 3, steps=40, resume=resume, save_every=seldom)
 """
 
 
@@ -137,11 +138,12 @@ def child(out, moment, resume=False):
     return subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE)
 
 
-@pytest.mark.parametrize("moment", ["half written", "before the rename", "between both"])
+@pytest.mark.parametrize("moment", ["half written", "before the rename", "between both", "before there is a last"])
 def test_killed_while_it_saves_a_run_goes_on_bit_for_bit(tmp_path, undisturbed, moment):
     with child(tmp_path / "run", moment) as process:
         _, said = process.communicate(timeout=100)
     assert process.returncode == -signal.SIGKILL, said.decode()
+    assert (tmp_path / "run" / "last.npz").exists() == (moment != "before there is a last")
     ran = run(Tiny(), tmp_path / "run", 3, steps=STEPS, resume=True)
     assert ran.chunk == STEPS
     alike(tmp_path / "run", undisturbed)

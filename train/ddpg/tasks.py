@@ -43,8 +43,8 @@ class Strokes:
     def judge(self, before: jax.Array, after: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The reward for any goal, from maps [..., H, W] in units of the blade's depth, and False: no goal ends an episode.
 
-        It is what a stroke takes off the squared distance, L_t - L_{t+1} with L = |g - h|^2 / 5. The
-        environment's reward is of the distance itself.
+        It is what a stroke takes off the squared distance, L_t - L_{t+1} with L = |g - h|^2 / 5; the
+        environment's own is of the distance.
         """
         return far(goal, before) - far(goal, after), jnp.zeros(before.shape[:-2], bool)
 

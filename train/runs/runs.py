@@ -249,14 +249,15 @@ def _begin(learner: Learner, out: Path, seed: int, there: bool) -> tuple[State, 
     """The state to go on from, and where the run is."""
     if there:
         _compare(_config(out), described(learner), seed, out)
-    if not (out / _LAST).exists() and (out / _BEST).exists():
-        raise ValueError(f"out: the run in {out} has lost {_LAST}; put it back, or begin anew in another folder")
     state = learner.init(seed)  # what cannot begin leaves no run
     if not there:
         versions = {name: metadata.version(name) for name in _PACKAGES} | {"python": platform.python_version()}
         config = {"name": learner.name, "seed": seed, "learner": described(learner), "versions": versions}
         write_json(out / _CONFIG, config)
-    return load_state(out / _LAST, state) if (out / _LAST).exists() else (state, At())
+    for name in (_LAST, _BEST):  # the best is written first, and is a whole state too
+        if (out / name).exists():
+            return load_state(out / name, state)
+    return state, At()
 
 
 def _compare(config: dict[str, Any], learner: object, seed: int, out: Path) -> None:
