@@ -2,12 +2,9 @@
 
 import gc
 import math
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")  # a worker a core: more threads only wait
 
 import jax
 import numpy as np
