@@ -66,7 +66,7 @@ JOBS = {
     "plan": Job(["-m", "jaxsand", "plan", "S", "--out", "out"]),
     "shape": Job(["-m", "jaxsand", "shape", "L", "--out", "out"]),
     "strokes": Job(
-        ["-m", "jaxsand", "bench", "strokes", "--methods", "random shooting", "--calls", "250", "--out", "out"], result=_rows
+        ["-m", "jaxsand", "bench", "strokes", "--methods", "random shooting", "--calls", "40", "--out", "out"], result=_rows
     ),
     "train": Job(["-m", "train", "dqn", "--steps", "30", "--out", "out"], ["--resume"], _trained),
 }
