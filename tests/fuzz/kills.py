@@ -132,22 +132,26 @@ def _taken(job: Job, out: Path) -> Any:
     return result
 
 
-def ended_in_time(job: Job, folder: Path, seconds: float) -> bool:
-    """Runs a command in a folder, for so many seconds at most: whether it has ended; else it is killed.
-
-    Raises:
-      BrokenError: if it failed, or hangs.
-    """
+def child(words: Sequence[str], folder: Path) -> "subprocess.Popen[str]":
+    """Starts Python in a folder, which has its caches too."""
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "XDG_CACHE_HOME": str(folder / "cache"),
         "MPLCONFIGDIR": str(folder / "cache"),
         "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
     }
-    words = [sys.executable, *job.words, *(job.more if (folder / "out" / "config.json").exists() else ())]
-    with subprocess.Popen(
-        words, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    ) as process:
+    return subprocess.Popen(
+        [sys.executable, *words], cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+
+
+def ended_in_time(job: Job, folder: Path, seconds: float) -> bool:
+    """Runs a command in a folder, for so many seconds at most: whether it has ended; else it is killed.
+
+    Raises:
+      BrokenError: if it failed, or hangs.
+    """
+    with child([*job.words, *(job.more if (folder / "out" / "config.json").exists() else ())], folder) as process:
         try:
             _, said = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:

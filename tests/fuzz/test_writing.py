@@ -24,7 +24,7 @@ from train.runs.runs import run as train
 
 from ..train.test_runs import Tiny
 from .judge import BrokenError
-from .kills import JOBS, Job, killed_often, whole
+from .kills import JOBS, Job, child, killed_often, whole
 
 HEIGHT = np.random.default_rng(0).normal(size=(40, 40))
 ROOT = Path(__file__).parents[2]
@@ -208,17 +208,6 @@ for k in range(10**9):
 """
 
 
-def child(words, folder):
-    environment = os.environ | {
-        "PYTHONPATH": str(ROOT),
-        "XDG_CACHE_HOME": str(folder.parent / "cache"),
-        "MPLCONFIGDIR": str(folder.parent),
-    }
-    return subprocess.Popen(
-        [sys.executable, *words], cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-
-
 @pytest.mark.slow
 def test_two_benches_that_are_killed_leave_rows_that_are_whole(tmp_path):
     path, chance = tmp_path / "rows.jsonl", random.Random(0)
@@ -231,7 +220,7 @@ def test_two_benches_that_are_killed_leave_rows_that_are_whole(tmp_path):
         time.sleep(0.3 * chance.random())
         for bench in benches:
             bench.kill()
-            bench.wait()
+            bench.communicate()
         rows = known_rows(path, {"who", "k"})
         assert rows[: len(before)] == before
         new = rows[len(before) :]
