@@ -10,12 +10,15 @@ must not change a map that is done, and its `done` returns one boolean for all m
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
+
+from jaxsand.autodiff._once import Axes, advanced, cotangents, recorded, tangent, whole
 
 if TYPE_CHECKING:
     from jaxsand.autodiff.while_loop import Step, TrailingStep
@@ -54,9 +57,9 @@ class Loop:
         """The number of records that the tape holds."""
         return max(1, min(self.bound, self.step.tape))
 
-    def over(self, axes: Tree) -> "Loop":
-        """The loop with one more leading batch axis: of the state, and of the params whose entry in `axes` is 0."""
-        done = None if self.done is None else jax.vmap(self.done, in_axes=(axes, None, 0))
+    def over(self, axes: Axes) -> "Loop":
+        """The loop with one more leading batch axis: of the state, and of the params that `axes` names."""
+        done = None if self.done is None else _ManyDone(self.done, axes)
         return Loop(done, _Many(self.step, axes), self.bound, self.batch_axes + 1)
 
     def ended(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
@@ -105,18 +108,39 @@ class Loop:
         return jax.tree.map(zeros, record)
 
 
+@dataclass(frozen=True)
 class _Many:
     """A step with one more leading batch axis."""
 
-    def __init__(self, step: "Step", axes: Tree) -> None:
-        self.tape = step.tape
-        self.call = jax.vmap(step, in_axes=(axes, None, 0))
-        self.recorded = jax.vmap(step.recorded, in_axes=(axes, None, 0))
-        self.jvp = jax.vmap(step.jvp, in_axes=(axes, None, 0, 0, 0))
-        self.vjp = jax.vmap(step.vjp, in_axes=(axes, None, 0, 0))
+    step: "Step"
+    axes: Axes
+
+    @property
+    def tape(self) -> int:
+        return self.step.tape
 
     def __call__(self, params: Tree, k: jax.Array, state: Tree) -> Tree:
-        return self.call(params, k, state)
+        return self.axes.over(partial(advanced, self.step), None, 0)(params, k, state)
+
+    def recorded(self, params: Tree, k: jax.Array, state: Tree) -> tuple[Tree, Tree]:
+        return self.axes.over(partial(recorded, self.step), None, 0)(params, k, state)
+
+    def jvp(self, params: Tree, k: jax.Array, record: Tree, dparams: Tree, dstate: Tree) -> Tree:
+        return self.axes.over(partial(tangent, self.step), None, 0, 0, 0)(params, k, record, dparams, dstate)
+
+    def vjp(self, params: Tree, k: jax.Array, record: Tree, cotangent: Tree) -> tuple[Tree, Tree]:
+        return self.axes.over(partial(cotangents, self.step), None, 0, 0)(params, k, record, cotangent)
+
+
+@dataclass(frozen=True)
+class _ManyDone:
+    """Which maps stop, with one more leading batch axis."""
+
+    done: Done
+    axes: Axes
+
+    def __call__(self, params: Tree, k: jax.Array, state: Tree) -> jax.Array:
+        return self.axes.over(self.done, None, 0)(params, k, state)
 
 
 def batched(program: Callable[..., Tree], loop: Loop, params: Tree, *rest: Tree) -> Tree:
@@ -124,14 +148,14 @@ def batched(program: Callable[..., Tree], loop: Loop, params: Tree, *rest: Tree)
 
     @custom_vmap
     def run(params: Tree, rest: Tree) -> Tree:
-        return program(loop, params, *rest)
+        return whole(program, loop, params, rest)
 
     @run.def_vmap
     def rule(size: int, mapped: list[Tree], params: Tree, rest: Tree) -> tuple[Tree, Tree]:
         if loop.trailing:
             out = _trailing(program, loop, size, mapped, (params, rest))
             return out, jax.tree.map(lambda _: True, out)
-        axes = jax.tree.map(lambda yes: 0 if yes else None, mapped[0])
+        axes = Axes.of(mapped[0])
         rest = jax.tree.map(lambda yes, x: x if yes else jnp.broadcast_to(x, (size, *x.shape)), mapped[1], rest)
         out = batched(program, loop.over(axes), params, *rest)
         return out, jax.tree.map(lambda _: True, out)
@@ -189,7 +213,7 @@ def run(loop: Loop, params: Tree, state: Tree) -> tuple[Tree, Tree]:
 
     def advance(carry: Tree) -> Tree:
         state, k, count, ended = carry
-        state = loop.keep(ended, state, loop.step(params, k, state))
+        state = loop.keep(ended, state, advanced(loop.step, params, k, state))
         k, count = k + 1, count + (~ended).astype(jnp.int32)
         return state, k, count, ended | loop.ended(params, k, state)
 
@@ -238,7 +262,7 @@ def record(loop: Loop, params: Tree, state: Tree) -> Forward:
 
     def advance(carry: Tree) -> Tree:
         state, k, count, ended, tape = carry
-        new, record = loop.step.recorded(params, k, state)
+        new, record = recorded(loop.step, params, k, state)
         tape = loop.put(tape, k % loop.room, record)
         state = loop.keep(ended, state, new)
         k, count = k + 1, count + (~ended).astype(jnp.int32)
@@ -259,7 +283,7 @@ def record(loop: Loop, params: Tree, state: Tree) -> Forward:
 
     zero = jnp.int32(0)
     ended = loop.ended(params, zero, state)
-    _, record = jax.eval_shape(loop.step.recorded, params, zero, state)
+    _, record = jax.eval_shape(partial(recorded, loop.step), params, zero, state)
     carry = (state, zero, jnp.zeros(ended.shape, jnp.int32), ended, loop.blank(loop.room, record))
     if loop.bound <= loop.room:
         state, _, count, _, tape = lax.while_loop(lambda c: ~jnp.all(c[3]), advance, carry)
@@ -279,8 +303,8 @@ def jvp(loop: Loop, params: Tree, state: Tree, count: jax.Array | None, dparams:
 
     def one(k: jax.Array, carry: Tree) -> Tree:
         x, dx = carry
-        new, record = loop.step.recorded(params, k, x)
-        dnew = loop.step.jvp(params, k, record, dparams, dx)
+        new, record = recorded(loop.step, params, k, x)
+        dnew = tangent(loop.step, params, k, record, dparams, dx)
         return loop.keep(loop.beyond(k, count), carry, (new, dnew))
 
     return lax.fori_loop(0, loop.total(count), one, (state, dstate))[1]
@@ -303,19 +327,19 @@ def vjp(
             # The record is part of what is carried: XLA would fetch it anew for all that uses it.
             (cf, cx), record = carry
             k = end - 1 - j
-            df, dx = loop.step.vjp(params, k, record, cx)
+            df, dx = cotangents(loop.step, params, k, record, cx)
             carry = loop.keep(loop.beyond(k, count), (cf, cx), (jax.tree.map(jnp.add, cf, df), dx))
             return carry, loop.get(tape, (k - 1) % loop.room)
 
         return lax.fori_loop(0, end - first, one, (carry, loop.get(tape, (end - 1) % loop.room)))[0]
 
-    floats = jax.eval_shape(loop.step.vjp, params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
+    floats = jax.eval_shape(partial(cotangents, loop.step), params, total, loop.get(tape, jnp.int32(0)), cotangent)[0]
     carry = (jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), floats), cotangent)
     if loop.bound <= loop.room:
         return backwards(jnp.int32(0), total, tape, carry)
 
     def again(k: jax.Array, c: Tree) -> Tree:
-        new, record = loop.step.recorded(params, k, c[0])
+        new, record = recorded(loop.step, params, k, c[0])
         return loop.keep(loop.beyond(k, count), c[0], new), loop.put(c[1], k % loop.room, record)
 
     def stretch(c: Tree) -> Tree:

@@ -25,7 +25,8 @@ Tree: TypeAlias = _batched_while.Tree
 class Step(Protocol):
     """One step of a loop, with its jvp and vjp.
 
-    All methods are pure, and none may close over traced values. `params` is a pytree that is the same in all steps, `k` the
+    All methods are pure, and none may close over traced values. A step can be hashed, and equal steps do the same: what JAX
+    traces for one serves for the other. `params` is a pytree that is the same in all steps, `k` the
     number of the step from 0, and `state` a pytree of floats.
     """
 
@@ -117,7 +118,8 @@ def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) 
     at the cost of about one forward pass, and half of one more for each doubling of the steps beyond 8 `step.tape`.
 
     Args:
-        done: whether to stop before step k; a function of params, k and the state that closes over no traced value.
+        done: whether to stop before step k; a function of params, k and the state that can be hashed and closes over no
+            traced value.
         step: the step.
         bound: largest number of steps.
         params: pytree of arrays.

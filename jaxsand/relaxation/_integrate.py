@@ -66,11 +66,11 @@ def sweep_loop(
         begin = partial(_with_momentum, bed)
         body = RklStages(scheme, interval)
         rate = float(scheme.rates[-1])
-        done = partial(_still_after_a_step, scheme, interval)
-        between = partial(_between_steps, scheme, interval)
+        between = _BetweenSteps(scheme, interval)
+        done = _StillAfterAStep(between)
     else:
         begin = _as_it_is
-        body = Plain(partial(_pairs if isinstance(scheme, Pairwise) else _sweeps, interval))
+        body = Plain(_Pairs(interval) if isinstance(scheme, Pairwise) else _Sweeps(interval))
         rate = scheme.share / 2 if isinstance(scheme, Pairwise) else scheme.rate
         done, between = _still, _always
     if tolerance is None:
@@ -111,20 +111,45 @@ def _still(params: GroupParams, k: jax.Array, sand: Swept) -> jax.Array:
     return still(params.bed, params.cells, params.limits, sand.height)
 
 
-def _still_after_a_step(plan: Schedule, interval: int, params: GroupParams, k: jax.Array, sand: Swept) -> jax.Array:
-    return _between_steps(plan, interval, k) & _still(params, k, sand)
+@dataclass(frozen=True)
+class _BetweenSteps:
+    """Whether group k is the first of a step of the schedule."""
+
+    plan: Schedule
+    interval: int
+
+    def __call__(self, k: jax.Array) -> jax.Array:
+        return jnp.any(jnp.asarray(self.plan.starts) == k * self.interval)
 
 
-def _between_steps(plan: Schedule, interval: int, k: jax.Array) -> jax.Array:
-    return jnp.any(jnp.asarray(plan.starts) == k * interval)
+@dataclass(frozen=True)
+class _StillAfterAStep:
+    """Whether the sand is still, and a step of the schedule complete."""
+
+    between: _BetweenSteps
+
+    def __call__(self, params: GroupParams, k: jax.Array, sand: Swept) -> jax.Array:
+        return self.between(k) & _still(params, k, sand)
 
 
-def _sweeps(interval: int, params: GroupParams, k: jax.Array, sand: Swept) -> Swept:
-    return repeat(Sweep(), interval, (params.bed, _flow(params, sand), params.cells), sand)
+@dataclass(frozen=True)
+class _Sweeps:
+    """A group of sweeps."""
+
+    interval: int
+
+    def __call__(self, params: GroupParams, k: jax.Array, sand: Swept) -> Swept:
+        return repeat(Sweep(), self.interval, (params.bed, _flow(params, sand), params.cells), sand)
 
 
-def _pairs(interval: int, params: GroupParams, k: jax.Array, sand: Swept) -> Swept:
-    return repeat(_EACH_PAIR, interval, (params.bed, _flow(params, sand)), sand)
+@dataclass(frozen=True)
+class _Pairs:
+    """A group of sweeps of `Pairwise`."""
+
+    interval: int
+
+    def __call__(self, params: GroupParams, k: jax.Array, sand: Swept) -> Swept:
+        return repeat(_EACH_PAIR, self.interval, (params.bed, _flow(params, sand)), sand)
 
 
 def _flow(params: GroupParams, sand: Swept) -> Flow:

@@ -161,9 +161,9 @@ def stable_rate(scene: Scene) -> float:
     return {4: 1 / 4, 8: 1 / (2 + 2 * 2**0.5), "isotropic": 1 / 4}[scene.grid.neighbours]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Schedule:
-    """The steps of super-time-stepping; each ends with, or within, a group of sweeps.
+    """The steps of super-time-stepping; each ends with, or within, a group of sweeps. Equal to itself alone: see `schedule`.
 
     Attributes:
         starts: number of the sweep with which each step begins.

@@ -120,11 +120,15 @@ def pass_over(
     return h + gained(bed, moved) * flow.quantum, lost
 
 
+def _one_sweep(params: tuple[Bed, Flow, Cells], k: jax.Array, sand: Swept) -> Swept:
+    return sweep(*params, sand)
+
+
 class Sweep(Plain):
     """A sweep as a step of a loop. `params` are the bed, the flow and the cells; the state is the sand."""
 
     def __init__(self) -> None:
-        super().__init__(lambda params, _, sand: sweep(params[0], params[1], params[2], sand))
+        super().__init__(_one_sweep)
 
     def vjp(self, params: tuple[Bed, Flow, Cells], k: jax.Array, record: Swept, cotangent: Swept) -> tuple[Tree, Swept]:
         """The vjp, with 4 or 8 neighbours, a closed edge and no floor by the formulas of flux_adjoint.py, else by JAX."""

@@ -86,3 +86,21 @@ def test_second_derivatives_are_refused():
         for twice in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
             with pytest.raises(NotImplementedError, match="second derivatives .*are not available"):
                 jax.make_jaxpr(twice(lambda h, stop=stop: f(h, stop)))(h)
+
+
+@pytest.mark.parametrize(
+    ("axes", "of"),
+    [(0, jax.grad), (1, lambda f: jax.vmap(jax.grad(f))), (2, lambda f: jax.vmap(jax.vmap(jax.jacfwd(f))))],
+)
+def test_the_steps_of_a_loop_in_a_loop_are_traced_a_few_times(axes, of):
+    """Traced anew wherever derivatives and batches ask, they were traced 21, 97 and 313 times."""
+    traced = []
+
+    def body(p, k, x):
+        traced.append(k)
+        return p * jnp.sin(x)
+
+    inner = Plain(body)
+    outer = Plain(lambda p, k, x: repeat(inner, 3, p, x))
+    jax.jit(of(lambda p, x: jnp.sum(repeat(outer, 4, p, x)))).trace(*2 * [jnp.ones((2,) * axes)])
+    assert 0 < len(traced) <= 10
