@@ -5,7 +5,7 @@ import math
 import sys
 
 from jaxsand.cli.arguments import Parser, count, draw_without_a_screen, ended, keep_compiled_programs, path_name, seed, width
-from train.commands import MINUTES, SHIPPED, run_evaluation, run_shipping, run_training
+from train.commands import MINUTES, SHIPPED, run_evaluation, run_export, run_shipping, run_training
 
 _STEPS = {
     "hindsight": "chunks of lessons",
@@ -36,6 +36,7 @@ def _parser() -> argparse.ArgumentParser:
         _training(commands, learner)
     _evaluation(commands)
     _shipping(commands)
+    _export(commands)
     return parser
 
 
@@ -77,6 +78,15 @@ def _shipping(commands: "argparse._SubParsersAction[Parser]") -> None:
     p.add_argument("--out-file", type=path_name, default=SHIPPED, metavar="FILE.npz", help="another place for it")
     p.add_argument("--json", action="store_true", help="print one JSON object")
     p.set_defaults(command=run_shipping)
+
+
+def _export(commands: "argparse._SubParsersAction[Parser]") -> None:
+    p = commands.add_parser("export", help="write a policy as a function that JAX alone can run")
+    p.add_argument("run", metavar="RUN|pretrained", help="folder of a hindsight run, or what jaxsand ships")
+    p.add_argument("--out", type=path_name, required=True, metavar="FILE", help="where to")
+    p.add_argument("--count", type=count, default=1, metavar="K", help="strokes for each map (1)")
+    p.add_argument("--json", action="store_true", help="print one JSON object")
+    p.set_defaults(command=run_export)
 
 
 def _minutes(text: str) -> float:

@@ -108,6 +108,24 @@ def run_shipping(options: argparse.Namespace) -> None:
     show(options, {"file": str(options.out_file), "bytes": options.out_file.stat().st_size, **about}, lines)
 
 
+def run_export(options: argparse.Namespace) -> None:
+    """Writes a policy as a function that JAX alone can run."""
+    if options.run == "pretrained":
+        from jaxsand.planning.learned.policy import load_policy
+
+        policy = load_policy()
+    else:
+        from train.imitation.hindsight import Hindsight
+        from train.runs.runs import learner_of, load
+
+        learner = learner_of(Path(options.run))
+        if not isinstance(learner, Hindsight):
+            raise ValueError(f"run: got one of {learner.name}; what hindsight learned is exported, or 'pretrained'")
+        policy = learner.policy(load(Path(options.run), learner))
+    policy.export(options.out, options.count)
+    show(options, {"file": str(options.out), "bytes": options.out.stat().st_size, "strokes": options.count}, lines)
+
+
 def _learner(options: argparse.Namespace) -> tuple["Learner", int | None]:
     """The learner, and the number of chunks after which it ends by itself, if any.
 

@@ -1,5 +1,7 @@
 """The policy's network, how strokes are read off it, and its file."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -172,3 +174,36 @@ def test_a_file_that_is_no_policy_is_refused(content, tmp_path):
         path.write_bytes(content)
     with pytest.raises(ValueError, match=r"policy: cannot read .*policy\.npz .*; reinstall jaxsand .*checkout"):
         load_policy(path)
+
+
+ELSEWHERE = """
+import sys
+sys.modules |= {"jaxsand": None, "flax": None}
+import numpy as np
+from jax import export
+with open("policy.jax", "rb") as file:
+    propose = export.deserialize(bytearray(file.read())).call
+goal, sand = np.load("maps.npy")
+np.savez("proposed.npz", *propose(goal, sand, np.float32(0.02), np.float32(0.01)))
+"""
+
+
+def test_a_policy_runs_without_jaxsand_and_flax(params, tmp_path):
+    policy, scene = Policy(NET, params), make_scene((SIDE, SIDE), 0.01, tool=Blade(0.02, 0.01, 0.02))
+    goal, current = np.asarray(maps(4, 3)) / 100, np.asarray(maps(5, 3)) / 100
+    np.save(tmp_path / "maps.npy", np.stack([goal, current]))
+    policy.export(tmp_path / "policy.jax", count=5)
+    done = subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "proposed.npz") as there:
+        strokes, scores = there["arr_0"], there["arr_1"]
+    here = policy.propose(scene, goal, current, count=5)
+    np.testing.assert_allclose(strokes, here[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(scores, here[1], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [0, 97, 1.5, True])
+def test_a_policy_is_not_exported_for_so_many_strokes(params, tmp_path, count):
+    with pytest.raises(ValueError, match=r"count: got .*; give a whole number from 1 to 96"):
+        Policy(NET, params).export(tmp_path / "policy.jax", count)
+    assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsand.planning.learned.policy import Policy, about_policy
+from jaxsand.planning.learned.policy import Policy, about_policy, load_policy
 from train import commands
 from train.__main__ import main
 from train.ddpg.learner import Ddpg
@@ -197,9 +197,23 @@ def test_mistakes_end_with_one_line_and_exit_code_2(tmp_path, quick, capsys, mon
     assert said(capsys, 2, "evaluate", tmp_path / "run").startswith("error: run: cannot read ")
 
 
-def test_only_what_hindsight_learned_is_shipped(tmp_path, capsys):
+def test_a_policy_is_exported(tmp_path, quick, capsys, monkeypatch):
+    run(SMALL, tmp_path / "run", 6, steps=2)
+    got = []
+    monkeypatch.setattr(Policy, "export", lambda *call: got.append(call) or Path(call[1]).write_bytes(b"1234"))
+    for of in (str(tmp_path / "run"), "pretrained"):
+        assert main(["export", of, "--out", str(tmp_path / "policy.jax"), "--count", "3", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == {"file": str(tmp_path / "policy.jax"), "bytes": 4, "strokes": 3}
+    (trained, *call), (shipped, *_) = got
+    assert call == [tmp_path / "policy.jax", 3]
+    np.testing.assert_array_equal(trained.params["params"]["eye"], [6.0, 6.0, 6.0])
+    assert shipped is load_policy()
+
+
+def test_only_what_hindsight_learned_is_shipped_or_exported(tmp_path, capsys):
     (tmp_path / "config.json").write_text(json.dumps({"seed": 0, "learner": {"is": "train.ddpg.learner:Ddpg"}}))
     assert said(capsys, 2, "ship", tmp_path).startswith("error: run: got one of ddpg")
+    assert said(capsys, 2, "export", tmp_path, "--out", tmp_path / "file").startswith("error: run: got one of ddpg")
 
 
 def test_help_answers_without_jax():
@@ -209,5 +223,5 @@ def test_help_answers_without_jax():
         [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": root}, check=False
     )
     assert got.returncode == 0, got.stderr
-    for word in ("hindsight", "dqn", "actor-critic", "ddpg", "evaluate", "ship"):
+    for word in ("hindsight", "dqn", "actor-critic", "ddpg", "evaluate", "ship", "export"):
         assert word in got.stdout

@@ -24,7 +24,7 @@ Params = Mapping[str, Any]
 
 _STARTS = 32  # peaks of the starts
 _ENDS = 12  # peaks of the ends from each
-_LINES = 96  # of the likeliest pairs of these, along which the network looks
+LINES = 96  # of the likeliest pairs of these, along which the network looks
 _TRUST = 0.3  # in the likelihoods of ends, beside what is seen along the line
 _ALONG = 12  # places that are looked at from end to end
 _BEYOND = 1.5  # cells: and one before and one behind
@@ -345,7 +345,7 @@ def _candidates(scores: Scores) -> tuple[jax.Array, jax.Array]:
     b = jax.vmap(lambda share, cells: jax.vmap(lambda cell: _centre(share, cell))(cells))(end, last)
     strokes = jnp.concatenate([jnp.broadcast_to(a[:, None], b.shape), b], -1)
     both = jnp.log(jnp.maximum(p, 1e-9))[:, None] + jnp.log(jnp.maximum(q, 1e-9))
-    log_shares, which = jax.lax.top_k(both.ravel(), _LINES)
+    log_shares, which = jax.lax.top_k(both.ravel(), LINES)
     return strokes.reshape(-1, 4)[which], log_shares
 
 

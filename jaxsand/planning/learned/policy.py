@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
+from jax import export
 
 from jaxsand.goals.untrusted import read_arrays
-from jaxsand.goals.writing import reason
-from jaxsand.planning.learned.network import Params, StrokeNet, judge, likeliest, symmetric
+from jaxsand.goals.writing import reason, written
+from jaxsand.planning.learned.network import LINES, Params, StrokeNet, judge, likeliest, symmetric
 from jaxsand.scene.scene import Scene, blade_of
 
 SIDE = 32
@@ -72,6 +73,51 @@ class Policy:
         most = np.array([*scene.grid.shape[::-1]] * 2, np.float32) - 0.5
         strokes = np.clip(np.take_along_axis(strokes, order[..., None], 1), 0.5, np.maximum(most, 0.5))
         return strokes * dx, np.take_along_axis(score, order, 1)
+
+    def export(self, path: str | Path, count: int = 1) -> None:
+        """Writes the policy as one function in a file, which runs wherever JAX does, without jaxsand and flax.
+
+        The function takes goals and maps [B, 32, 32] (m), the blade's depth (m) and the spacing (m), all in float32, and
+        returns what `propose` does: strokes [B, count, 4] (m), likeliest first, and the logarithms of their likelihoods
+        [B, count]. It serves any B, on CPUs, on GPUs by CUDA and on TPUs. JAX promises that it can read such files for six
+        months; keep the run's own checkpoint for longer.
+
+        Args:
+          path: the file.
+          count: how many strokes for each map.
+
+        Raises:
+          ValueError: `count` is not from 1 to 96, the file cannot be written, or flatbuffers is not installed
+            (`pip install 'jaxsand[export]'`).
+
+        Example:
+          >>> from pathlib import Path
+          >>> import jax.numpy as jnp
+          >>> from jax import export
+          >>> from jaxsand.planning.learned.policy import load_policy
+          >>> load_policy().export("policy.jax", count=2)  # doctest: +SKIP
+          >>> propose = export.deserialize(Path("policy.jax").read_bytes()).call  # doctest: +SKIP
+          >>> goal, sand = jnp.zeros((5, 32, 32)).at[:, 10:20, 8:10].set(-0.0075), jnp.zeros((5, 32, 32))  # doctest: +SKIP
+          >>> strokes, scores = propose(goal, sand, jnp.float32(0.0075), jnp.float32(0.01))  # doctest: +SKIP
+        """
+        if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= LINES:
+            raise ValueError(f"count: got {count!r}; give a whole number from 1 to {LINES}")
+
+        def propose(
+            goal: jax.Array, current: jax.Array, depth: jax.Array, spacing: jax.Array
+        ) -> tuple[jax.Array, jax.Array]:
+            strokes, score = _proposed(self.net, self.params, count, goal / depth, current / depth)
+            return jnp.clip(strokes, 0.5, SIDE - 0.5) * spacing, score
+
+        maps = jax.ShapeDtypeStruct((*export.symbolic_shape("B"), SIDE, SIDE), jnp.float32)
+        number = jax.ShapeDtypeStruct((), jnp.float32)
+        function = export.export(jax.jit(propose), platforms=("cpu", "cuda", "tpu"))(maps, maps, number, number)
+        try:
+            data = function.serialize()
+        except ImportError:
+            raise ValueError("export: flatbuffers is not installed; run pip install 'jaxsand[export]'") from None
+        with written(Path(path)) as file:
+            file.write_bytes(data)
 
 
 def in_batches(
