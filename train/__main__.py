@@ -81,7 +81,7 @@ def _shipping(commands: "argparse._SubParsersAction[Parser]") -> None:
 
 
 def _export(commands: "argparse._SubParsersAction[Parser]") -> None:
-    p = commands.add_parser("export", help="write a policy as a function that JAX alone can run")
+    p = commands.add_parser("export", help="write a policy as a function that JAX runs without jaxsand")
     p.add_argument("run", metavar="RUN|pretrained", help="folder of a hindsight run, or what jaxsand ships")
     p.add_argument("--out", type=path_name, required=True, metavar="FILE", help="where to")
     p.add_argument("--count", type=count, default=1, metavar="K", help="strokes for each map (1)")

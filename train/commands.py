@@ -109,7 +109,7 @@ def run_shipping(options: argparse.Namespace) -> None:
 
 
 def run_export(options: argparse.Namespace) -> None:
-    """Writes a policy as a function that JAX alone can run."""
+    """Writes a policy as a function that JAX runs without jaxsand."""
     if options.run == "pretrained":
         from jaxsand.planning.learned.policy import load_policy
 

@@ -21,7 +21,7 @@ Tree = Any
 
 @partial(jax.jit, static_argnums=0)
 def advanced(step: "Step", params: Tree, k: jax.Array, state: Tree) -> Tree:
-    """The step itself; see `Step`, as for the next three."""
+    """`Step.__call__`."""
     return step(params, k, state)
 
 

@@ -25,8 +25,9 @@ Tree: TypeAlias = _batched_while.Tree
 class Step(Protocol):
     """One step of a loop, with its jvp and vjp.
 
-    All methods are pure, and none may close over traced values. A step can be hashed, and equal steps do the same: what JAX
-    traces for one serves for the other. `params` is a pytree that is the same in all steps, `k` the
+    All methods are pure, and none may close over traced values. A step must be hashable, and equal steps must do the same:
+    what JAX traces for one serves for the other, and is kept with all that the step holds. So make steps of frozen
+    dataclasses, or once in a module. `params` is a pytree that is the same in all steps, `k` the
     number of the step from 0, and `state` a pytree of floats.
     """
 
@@ -130,6 +131,7 @@ def repeat_until(done: Done, step: Step, bound: int, params: Tree, state: Tree) 
 
     Raises:
         NotImplementedError: a second derivative is asked for.
+        ValueError: the step or `done` cannot be hashed.
 
     Example:
         >>> import jax

@@ -42,6 +42,16 @@ class Repeated(Step, Protocol):
 
 
 @dataclass(frozen=True)
+class _Complete:
+    """`done` of a step; equal for equal steps, as bound methods are not."""
+
+    step: Repeated
+
+    def __call__(self, params: Any, k: jax.Array, sand: Moving) -> jax.Array:
+        return self.step.done(params, k, sand)
+
+
+@dataclass(frozen=True)
 class LegSteps:
     """What a tool does on a leg.
 
@@ -103,7 +113,7 @@ def moved(
         alike = jnp.clip(before.cos * pose.cos + before.sin * pose.sin, 0, 1)
         flux = _times(alike, seen(block, frame, first(jnp.int32(0)), kept.ahead))
     sand, count = repeat_until(
-        steps.ahead.done, steps.ahead, bound, params(there, start, onmap, zero), replace(sand, flux=flux)
+        _Complete(steps.ahead), steps.ahead, bound, params(there, start, onmap, zero), replace(sand, flux=flux)
     )
     if steps.ahead.keeps:
         last = count - 1 - int(before is None)
@@ -125,7 +135,7 @@ def _turned(
     flux = _times(alike, seen(block, frame, first, kept.turned))
     turn = params(site, before, jnp.zeros_like(angle), angle)
     bound = math.ceil(math.pi * math.hypot(*shape) / steps.turn.substep) + 1
-    sand, _ = repeat_until(steps.turn.done, steps.turn, bound, turn, replace(sand, flux=flux))
+    sand, _ = repeat_until(_Complete(steps.turn), steps.turn, bound, turn, replace(sand, flux=flux))
     turns = sense != 0
     return sand, replace(
         kept,

@@ -54,7 +54,7 @@ def descend(
     height, lost = halo(at(sand.height) + _spread(cells, cut, change, at(sand.height))), sand.lost
     if lost is not None and ended.lost is not None:
         lost = jax.tree.map(lambda g, x: g.at[::2, ::2].add(jnp.where(early_end, 0, 4 * x)), lost, ended.lost)
-    late = schedule(scheme.steps(), limit, bound, interval)
+    late = schedule(scheme.steps(), limit, bound, interval, 0.0)
     sand, again = sweep_loop(bed, cells, late, tolerance, interval).run(bound // interval, Swept(height, lost))
     return sand, taken + again + jnp.where(early_end, 0, (more + 3) // 4)
 

@@ -163,7 +163,9 @@ def stable_rate(scene: Scene) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """The steps of super-time-stepping; each ends with, or within, a group of sweeps. Equal to itself alone: see `schedule`.
+    """The steps of super-time-stepping; each ends with, or within, a group of sweeps.
+
+    Compared by identity: `schedule` gives the same object for like arguments.
 
     Attributes:
         starts: number of the sweep with which each step begins.
@@ -177,7 +179,7 @@ class Schedule:
 
 
 @cache
-def schedule(scheme: SuperTimeStepping, limit: float, sweeps: int, group: int, elapsed: float = 0.0) -> Schedule:
+def schedule(scheme: SuperTimeStepping, limit: float, sweeps: int, group: int, elapsed: float) -> Schedule:
     """The steps that make up `sweeps` sweeps in groups of `group`, from the time `elapsed` on; `limit` is the stable rate.
 
     A step lies within one group, or consists of whole groups.

@@ -253,7 +253,7 @@ def _run(scene: Scene, bed: Bed, scheme: Scheme, stop: Stop, sand: Swept) -> tup
 
 def _sweep_loop(scene: Scene, bed: Bed, scheme: OnOneGrid, stop: Stop) -> SweepLoop:
     bound, interval = _groups(stop)
-    plan = schedule(scheme, stable_rate(scene), bound, interval) if isinstance(scheme, SuperTimeStepping) else scheme
+    plan = schedule(scheme, stable_rate(scene), bound, interval, 0.0) if isinstance(scheme, SuperTimeStepping) else scheme
     return sweep_loop(bed, WholeCells(), plan, None if isinstance(stop, Sweeps) else jnp.asarray(stop.tolerance), interval)
 
 

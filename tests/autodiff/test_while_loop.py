@@ -1,5 +1,7 @@
 """Loops against the same steps written out: values, derivatives however long they are, and what is refused."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,3 +106,31 @@ def test_the_steps_of_a_loop_in_a_loop_are_traced_a_few_times(axes, of):
     outer = Plain(lambda p, k, x: repeat(inner, 3, p, x))
     jax.jit(of(lambda p, x: jnp.sum(repeat(outer, 4, p, x)))).trace(*2 * [jnp.ones((2,) * axes)])
     assert 0 < len(traced) <= 10
+
+
+def test_a_step_that_cannot_be_hashed_is_refused():
+    @dataclass
+    class Changing:
+        factor: float
+
+        def __call__(self, p, k, x):
+            return self.factor * x
+
+    with pytest.raises(ValueError, match="Non-hashable"):
+        repeat(Plain(Changing(2.0)), 3, 1.0, jnp.ones(()))
+
+
+def test_what_was_traced_for_a_step_serves_an_equal_one_and_no_other():
+    traced = []
+
+    @dataclass(frozen=True)
+    class Times:
+        factor: float
+
+        def __call__(self, p, k, x):
+            traced.append(self.factor)
+            return self.factor * x
+
+    ends = [float(repeat(Plain(Times(factor)), 3, 1.0, jnp.ones(()))) for factor in (2.0, 3.0, 2.0)]
+    assert ends == [8, 27, 8]
+    assert traced == [2.0, 3.0]

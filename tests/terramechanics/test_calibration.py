@@ -166,7 +166,7 @@ def test_a_push_tells_the_angle_and_the_blade(push):
 
 @pytest.mark.wide
 def test_a_noisy_push_tells_them_within_four_standard_errors():
-    """How a push makes its heap plays no part in that."""
+    """By the quicker rule of the two; the search and the estimate of errors do not know which."""
     near, push = sand(29, js.Blade(0.021, 0.015, 0.0072)), js.SwathPush()
     found = js.calibrate(near, js.Trial(LEVEL, pushed_by(push) + noise(1), STROKE), push=push, grid=js.OneGrid())
     assert found.verdict == js.Verdict.GRID_UNKNOWN

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ SIDE = 32
 """The cells along a side of the maps that the network reads, and was trained on."""
 
 _STRIDE = 16  # between the looks at a larger map
+_NOTHING = 1e-30  # the share of what is due in a part of a map where nothing is
 _SIZES = (1, 8, 64)  # of batches, so that a few programs serve all
 _FILE = "policy.npz"
 _WIDEST = 4096  # features of a network
@@ -65,9 +67,9 @@ class Policy:
         for row, column in _looks(scene.grid.shape):
             a, b = (_part(x, row, column) for x in (goal, current))
             strokes, score = in_batches(partial(_proposed, self.net, self.params, count), a, b, _SIZES)
-            share = ((a - b) ** 2).sum((1, 2)) / np.maximum(undone, 1e-30)
+            share = ((a - b) ** 2).sum((1, 2)) / np.maximum(undone, _NOTHING)
             found.append(strokes + np.array([column, row, column, row], np.float32))
-            scores.append(score + np.log(np.maximum(share, 1e-30))[:, None])
+            scores.append(score + np.log(np.maximum(share, _NOTHING))[:, None])
         strokes, score = np.concatenate(found, 1), np.concatenate(scores, 1)
         order = np.argsort(-score, axis=1, kind="stable")[:, :count]
         most = np.array([*scene.grid.shape[::-1]] * 2, np.float32) - 0.5
@@ -75,12 +77,13 @@ class Policy:
         return strokes * dx, np.take_along_axis(score, order, 1)
 
     def export(self, path: str | Path, count: int = 1) -> None:
-        """Writes the policy as one function in a file, which runs wherever JAX does, without jaxsand and flax.
+        """Writes the policy as one function in a file, which JAX runs without jaxsand and flax.
 
         The function takes goals and maps [B, 32, 32] (m), the blade's depth (m) and the spacing (m), all in float32, and
         returns what `propose` does: strokes [B, count, 4] (m), likeliest first, and the logarithms of their likelihoods
-        [B, count]. It serves any B, on CPUs, on GPUs by CUDA and on TPUs. JAX promises that it can read such files for six
-        months; keep the run's own checkpoint for longer.
+        [B, count]. The depth must be above 0. It serves any B, and is lowered for CPUs, for GPUs by CUDA and for TPUs. To
+        read it takes JAX, no older than the one here, and flatbuffers. Later JAX reads such files for six months: keep the
+        run's own checkpoint for longer.
 
         Args:
           path: the file.
@@ -100,24 +103,24 @@ class Policy:
           >>> goal, sand = jnp.zeros((5, 32, 32)).at[:, 10:20, 8:10].set(-0.0075), jnp.zeros((5, 32, 32))  # doctest: +SKIP
           >>> strokes, scores = propose(goal, sand, jnp.float32(0.0075), jnp.float32(0.01))  # doctest: +SKIP
         """
+        if find_spec("flatbuffers") is None:
+            raise ValueError("export: flatbuffers is not installed; run pip install 'jaxsand[export]'")
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= LINES:
             raise ValueError(f"count: got {count!r}; give a whole number from 1 to {LINES}")
 
         def propose(
             goal: jax.Array, current: jax.Array, depth: jax.Array, spacing: jax.Array
         ) -> tuple[jax.Array, jax.Array]:
-            strokes, score = _proposed(self.net, self.params, count, goal / depth, current / depth)
-            return jnp.clip(strokes, 0.5, SIDE - 0.5) * spacing, score
+            goal, current = goal / depth, current / depth
+            strokes, score = _proposed(self.net, self.params, count, goal, current)
+            undone = jnp.any(goal != current, axis=(1, 2))
+            return jnp.clip(strokes, 0.5, SIDE - 0.5) * spacing, score + jnp.where(undone, 0, math.log(_NOTHING))[:, None]
 
         maps = jax.ShapeDtypeStruct((*export.symbolic_shape("B"), SIDE, SIDE), jnp.float32)
         number = jax.ShapeDtypeStruct((), jnp.float32)
         function = export.export(jax.jit(propose), platforms=("cpu", "cuda", "tpu"))(maps, maps, number, number)
-        try:
-            data = function.serialize()
-        except ImportError:
-            raise ValueError("export: flatbuffers is not installed; run pip install 'jaxsand[export]'") from None
-        with written(Path(path)) as file:
-            file.write_bytes(data)
+        with written(Path(path), "path") as file:
+            file.write_bytes(function.serialize())
 
 
 def in_batches(
