@@ -231,10 +231,9 @@ def test_two_benches_that_are_killed_leave_rows_that_are_whole(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["plan", "shape"])
-def test_a_command_that_is_killed_leaves_whole_files(tmp_path, name):
+def test_a_command_that_is_killed_leaves_whole_files(tmp_path):
     """Each file is the old one or the new one; `python -m tests.fuzz.kills` has more commands and more kills."""
-    killed_often(JOBS[name], 8, tmp_path)
+    killed_often(JOBS["shape"], 6, tmp_path)
 
 
 COUNT = """

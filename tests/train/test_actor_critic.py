@@ -291,10 +291,9 @@ def test_it_finds_the_known_values_of_a_probe_on_maps():
 def test_a_small_network_learns_on_sand():
     learner = ActorCritic(plans=8, updates=24, batch=16, capacity=2048, widths=(16, 16, 16), blocks=(1, 1, 1))
     state = learner.init(0)
-    first = learner.validate(state)
     for _ in range(5):
         state, _ = learner.advance(state)
     last = learner.validate(state)
     assert set(last) == {"score", "right", "strokes", "iou"}
-    assert last["score"] > first["score"] + 0.05
+    assert last["score"] > 0.08  # 0.03 before it learned
     assert isinstance(state.memory, Memory)
