@@ -68,7 +68,7 @@ JOBS = {
     "strokes": Job(
         ["-m", "jaxsand", "bench", "strokes", "--methods", "random shooting", "--calls", "40", "--out", "out"], result=_rows
     ),
-    "train": Job(["-m", "train", "dqn", "--steps", "30", "--out", "out"], ["--resume"], _trained),
+    "train": Job(["-m", "train", "dqn", "--steps", "8", "--out", "out"], ["--resume"], _trained),
 }
 LIMIT = 900.0
 """Seconds after which a command that nobody kills hangs."""
