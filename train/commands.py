@@ -16,6 +16,7 @@ from jaxsand.scene.progress import Tell
 
 if TYPE_CHECKING:
     from jaxsand.planning.learned.beam_search import Proposes
+    from jaxsand.planning.learned.policy import Policy
     from train.dqn.learner import Dqn, Walking
     from train.runs.runs import Learner
 
@@ -88,12 +89,9 @@ def run_evaluation(options: argparse.Namespace) -> None:
 def run_shipping(options: argparse.Namespace) -> None:
     """Writes a run's best policy into the package, with notes on how it was made."""
     from jaxsand.planning.learned.policy import save_policy
-    from train.imitation.hindsight import Hindsight
-    from train.runs.runs import about_run, learner_of, load, seed_of
+    from train.runs.runs import about_run, seed_of
 
-    learner = learner_of(options.run)
-    if not isinstance(learner, Hindsight):
-        raise ValueError(f"run: got one of {learner.name}; jaxsand ships what hindsight learned")
+    policy = _policy_of(options.run, "jaxsand ships what hindsight learned")
     at, seed = about_run(options.run), seed_of(options.run)
     about: dict[str, float | str] = {
         "command": f"python -m train hindsight --seed {seed} --steps {at.chunk}",
@@ -102,7 +100,6 @@ def run_shipping(options: argparse.Namespace) -> None:
         "minutes": round(at.seconds / 60, 2),
         "score": round(at.score, 4),
     }
-    policy = learner.policy(load(options.run, learner))
     with written(options.out_file) as path:
         save_policy(policy, path, **about)
     show(options, {"file": str(options.out_file), "bytes": options.out_file.stat().st_size, **about}, lines)
@@ -115,15 +112,20 @@ def run_export(options: argparse.Namespace) -> None:
 
         policy = load_policy()
     else:
-        from train.imitation.hindsight import Hindsight
-        from train.runs.runs import learner_of, load
-
-        learner = learner_of(Path(options.run))
-        if not isinstance(learner, Hindsight):
-            raise ValueError(f"run: got one of {learner.name}; what hindsight learned is exported, or 'pretrained'")
-        policy = learner.policy(load(Path(options.run), learner))
+        policy = _policy_of(Path(options.run), "what hindsight learned is exported, or 'pretrained'")
     policy.export(options.out, options.count)
     show(options, {"file": str(options.out), "bytes": options.out.stat().st_size, "strokes": options.count}, lines)
+
+
+def _policy_of(run: Path, remedy: str) -> "Policy":
+    """The best policy of a hindsight run."""
+    from train.imitation.hindsight import Hindsight
+    from train.runs.runs import learner_of, load
+
+    learner = learner_of(run)
+    if not isinstance(learner, Hindsight):
+        raise ValueError(f"run: got one of {learner.name}; {remedy}")
+    return learner.policy(load(run, learner))
 
 
 def _learner(options: argparse.Namespace) -> tuple["Learner", int | None]:

@@ -11,19 +11,18 @@ must not change a map that is done, and its `done` returns one boolean for all m
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from jaxsand.autodiff._once import Axes, advanced, cotangents, recorded, tangent, whole
+from jaxsand.autodiff._once import Axes, Tree, advanced, cotangents, recorded, tangent, whole
 
 if TYPE_CHECKING:
     from jaxsand.autodiff.while_loop import Step, TrailingStep
 
-Tree = Any
 Done = Callable[[Tree, jax.Array, Tree], jax.Array]
 KEPT = 8  # states of a long loop that the forward pass keeps for reverse mode; when full, it drops every other one
 SPARE = 2  # further states that reverse mode may keep between them

@@ -16,10 +16,10 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from jaxsand.autodiff import _batched_while
+from jaxsand.autodiff import _batched_while, _once
 from jaxsand.autodiff._batched_while import Done, Forward, Loop
 
-Tree: TypeAlias = _batched_while.Tree
+Tree: TypeAlias = _once.Tree
 
 
 class Step(Protocol):
@@ -27,8 +27,8 @@ class Step(Protocol):
 
     All methods are pure, and none may close over traced values. A step must be hashable, and equal steps must do the same:
     what JAX traces for one serves for the other, and is kept with all that the step holds. So make steps of frozen
-    dataclasses, or once in a module. `params` is a pytree that is the same in all steps, `k` the
-    number of the step from 0, and `state` a pytree of floats.
+    dataclasses, or once in a module. `params` is a pytree that is the same in all steps, `k` the number of the step from 0,
+    and `state` a pytree of floats.
     """
 
     @property
